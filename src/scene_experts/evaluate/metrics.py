@@ -1,5 +1,5 @@
-"""Scores of a rendered picture against its photograph: PSNR, SSIM, LPIPS, sharpness. Each name
-stands for one exact variant.
+"""Scores of a rendered picture against its photograph: PSNR, SSIM, LPIPS, detail, sharpness. Each
+name stands for one exact variant.
 
 Pictures are [H, W, 3] float RGB in [0, 1] with 8-bit values, masks [H, W] in [0, 1] (1 = the pixel
 counts). With a mask, only counted pixels are scored: the photograph replaces the rest of the
@@ -50,15 +50,38 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 def sharpness(image: Tensor, mask: Tensor | None = None) -> float:
     """Return the mean norm of the brightness gradient (forward differences per pixel). Blur lowers
     it; 0 for a side of 1 px."""
-    gray = image.mean(dim=2)
-    if min(gray.shape) < 2:
+    if min(image.shape[:2]) < 2:
         return 0.0
-    dx, dy = gray[:-1, 1:] - gray[:-1, :-1], gray[1:, :-1] - gray[:-1, :-1]
-    length = (dx.square() + dy.square()).sqrt()
+    length = _find_gradient(image).square().sum(dim=0).sqrt()
     if mask is None:
         return float(length.mean())
-    weight = torch.minimum(mask[:-1, :-1], torch.minimum(mask[:-1, 1:], mask[1:, :-1]))
+    weight = _of_differences(mask)
     return float((length * weight).sum() / weight.sum().clamp_min(1e-12))
+
+
+def detail(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
+    """Return the share of the photograph's detail that the render has: the projection of its
+    brightness gradient on that of the photograph, over the photograph's own.
+
+    1 for identical pictures. Blur lowers it, and noise and specks do not raise it. None for a
+    photograph without gradients.
+    """
+    ours, theirs = _find_gradient(image).double(), _find_gradient(target).double()
+    if mask is not None:
+        theirs = theirs * _of_differences(mask)
+    whole = float((theirs * _find_gradient(target)).sum())
+    return float((ours * theirs).sum()) / whole if whole > 0 else None
+
+
+def _find_gradient(image: Tensor) -> Tensor:
+    """Return the forward differences of the brightness [2, H - 1, W - 1]."""
+    gray = image.mean(dim=2)
+    return torch.stack([gray[:-1, 1:] - gray[:-1, :-1], gray[1:, :-1] - gray[:-1, :-1]])
+
+
+def _of_differences(mask: Tensor) -> Tensor:
+    """Return how much each forward difference counts [H - 1, W - 1]."""
+    return torch.minimum(mask[:-1, :-1], torch.minimum(mask[:-1, 1:], mask[1:, :-1]))
 
 
 def _fill_masked(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Tensor, float]:
@@ -130,7 +153,7 @@ class Perceptual:
         return out
 
 
-def score(image: Tensor, target: Tensor, mask: Tensor | None, perceptual: Perceptual) -> dict[str, float]:
+def score(image: Tensor, target: Tensor, mask: Tensor | None, perceptual: Perceptual) -> dict[str, float | None]:
     """Return every score of one view by name, with the sharpness of the render and of the
     photograph."""
     with _full_precision():
@@ -138,6 +161,7 @@ def score(image: Tensor, target: Tensor, mask: Tensor | None, perceptual: Percep
             "psnr": psnr(image, target, mask),
             "ssim": ssim(image, target, mask),
             **perceptual(image, target, mask),
+            "detail": detail(image, target, mask),
             "sharpness": sharpness(image, mask),
             "sharpness_photo": sharpness(target, mask),
         }

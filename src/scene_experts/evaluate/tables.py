@@ -73,7 +73,10 @@ COLUMNS = (
     ResultColumn(
         "active %", ("activation_ratio",), 1, 100.0, research=True, about="share of the decoded Gaussians whose opacity is positive."
     ),
-    ResultColumn("sharpness", ("sharpness", "ratio"), 2, about="fine detail of the renders relative to the photographs; 1 is as sharp."),
+    ResultColumn(
+        "detail", ("detail",), 2, best=1,
+        about="share of the photographs' fine detail that the renders have; 1 is all of it. Specks and noise do not count.",
+    ),
     ResultColumn("FPS", ("fps", "fps"), 1, best=1, about="pictures drawn per second on the machine that scored the run."),
     ResultColumn("iterations", ("step",), counted=True, about="training steps until the scored checkpoint."),
     ResultColumn(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -75,6 +76,28 @@ def test_sharpness() -> None:
     assert metrics.sharpness(both, mask) == pytest.approx(math.sqrt(2))
 
 
+def test_detail_is_the_share_of_the_photographs_gradient() -> None:
+    gray = torch.rand(9, 12, generator=torch.Generator().manual_seed(0))
+    target = gray[..., None].expand(-1, -1, 3)
+    assert metrics.detail(target, target) == pytest.approx(1)
+    assert metrics.detail(0.3 * target + 0.2, target) == pytest.approx(0.3)
+    assert metrics.detail(1 - target, target) == pytest.approx(-1)
+    assert metrics.detail(torch.zeros_like(target), target) == 0 and metrics.detail(target, torch.zeros_like(target)) is None
+    dx, dy = np.diff(gray.numpy(), axis=1)[:-1], np.diff(gray.numpy(), axis=0)[:, :-1]
+    other = torch.rand(9, 12, 3, generator=torch.Generator().manual_seed(1))
+    mean = other.mean(2).numpy()
+    projected = (np.diff(mean, axis=1)[:-1] * dx + np.diff(mean, axis=0)[:, :-1] * dy)[:, :5].sum()
+    mask = (torch.arange(12) < 6).float().expand(9, -1)  # differences of five columns
+    assert metrics.detail(other, target, mask) == pytest.approx(projected / (dx[:, :5] ** 2 + dy[:, :5] ** 2).sum(), rel=1e-5)
+
+
+def test_specks_do_not_raise_the_detail() -> None:
+    target = torch.linspace(0, 1, 64)[None, :, None].expand(48, 64, 3)
+    specks = target + 0.2 * (torch.rand(48, 64, 1, generator=torch.Generator().manual_seed(2)) > 0.9)
+    assert metrics.sharpness(specks) > 2 * metrics.sharpness(target)
+    assert metrics.detail(specks, target) == pytest.approx(1, abs=0.2)
+
+
 def test_each_variant_gets_its_own_input() -> None:
     networks = {net: Lpips(net, random_tensors(net)) for net in ("vgg", "alex")}
     image, target = pair()
@@ -125,4 +148,4 @@ def test_scores_on_cuda_are_those_on_the_cpu() -> None:
 def test_pictures_of_one_pixel_have_finite_scores():
     for shape in ((1, 1, 3), (1, 5, 3), (5, 1, 3)):
         found = metrics.score(torch.rand(shape), torch.rand(shape), None, metrics.Perceptual.off())
-        assert all(math.isfinite(value) for value in found.values())
+    assert found.pop("detail") is None and all(math.isfinite(value) for value in found.values())

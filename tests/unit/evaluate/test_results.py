@@ -42,9 +42,9 @@ def test_runs_trained_after_they_were_scored_are_reported(tmp_path):
 
 
 def test_means_are_over_the_views_that_have_a_score():
-    view = {"psnr": 20.0, "ssim": 0.5, "masked": False, "sharpness": 0.1, "sharpness_photo": 0.2}
-    found = describe_scores({"a": view, "b": {**view, "psnr": 30.0}, "hidden": {}}, Perceptual.off())
-    assert found["psnr"] == 25.0 and found["sharpness"]["ratio"] == 0.5 and not found["masked"]
+    view = {"psnr": 20.0, "ssim": 0.5, "masked": False, "detail": 0.8, "sharpness": 0.1, "sharpness_photo": 0.2}
+    found = describe_scores({"a": view, "b": {**view, "psnr": 30.0, "detail": None}, "hidden": {}}, Perceptual.off())
+    assert found["psnr"] == 25.0 and found["sharpness"]["ratio"] == 0.5 and found["detail"] == 0.8 and not found["masked"]
     assert found["lpips"] is None and "--no-lpips" in found["absent"]["lpips"]
     with pytest.raises(InputError, match="masks"):
         describe_scores({"hidden": {}}, Perceptual.off())

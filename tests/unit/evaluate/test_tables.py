@@ -35,7 +35,7 @@ def results(recipe: str, psnr: float, **other: Any) -> dict[str, Any]:
         "size": {"MB": 1.25},
         "anchors": 12345,
         "activation_ratio": 0.365,
-        "sharpness": {"ratio": 0.93},
+        "detail": 0.93,
         "fps": {"fps": 20.0, "decode_ms": 10.0, "raster_ms": 40.0, "device": "cpu"},
         "train_seconds": 100.0,
         "experts": {"color": {"share": [0.6, 0.4], "mean_gate": [0.5, 0.5], "entropy": 0.97}},
@@ -141,7 +141,7 @@ def test_print_results(tmp_path: Path) -> None:
     console = Console(file=io.StringIO(), width=200)
     tables.print_results(results("moe-gs", 27.5), console, tmp_path)
     text = console.file.getvalue()  # type: ignore[attr-defined]
-    assert "27.50" in text and "sharpness" in text and str(tmp_path / "results.json") in text
+    assert "27.50" in text and "detail" in text and "0.93" in text and str(tmp_path / "results.json") in text
     assert not any(word in text for word in ("entropy", "LPIPS (3DGS)", "active", "CPU s"))  # nobody can act on them after one run
     tables.print_results(results("moe-gs", 27.5, appearance="half"), console, tmp_path)
     text = console.file.getvalue()  # type: ignore[attr-defined]
