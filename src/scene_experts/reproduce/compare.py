@@ -41,7 +41,7 @@ def make_comparison(options: ReproduceOptions) -> Experiment:
         f"Comparison of {', '.join(rows)}",
         rows,
         tuple(DATASETS),
-        added=("anchors", "active_percent", "gaussians_rendered", "cpu_seconds"),
+        added=("lpips", "detail", "anchors", "active_percent", "gaussians_rendered", "cpu_seconds"),
         baselines=tuple(rows[name] for name in baselines),
     )
 

@@ -43,6 +43,9 @@ class ReproduceOptions:
     """Resolution policy (as-is, longest:PX and others), instead of what --scale gives."""
     seeds: Annotated[tuple[int, ...], Range(0)] = (0,)
     """Seeds; each experiment is run once for each."""
+    folds: Annotated[int | None, Range(2)] = None
+    """Train this many times for each run, so that every photograph is held out once, and score them
+    all. For captures of fewer than 40 photographs."""
     workers: Annotated[int | None, Range(1)] = None
     """Number of runs at a time, each in its own process; by default one, or one for each of
     --devices."""

@@ -11,6 +11,7 @@ from scene_experts.data.fetch import catalog
 from scene_experts.data.fetch.obtain import captures_dir
 from scene_experts.reproduce.compare import COMPARE, make_comparison
 from scene_experts.reproduce.experiments import EXPERIMENTS, OURS, Experiment
+from scene_experts.reproduce.folds import hold_out_each
 from scene_experts.reproduce.options import ReproduceOptions
 from scene_experts.reproduce.plan import (
     CaptureSpec,
@@ -54,7 +55,8 @@ def make_plan(options: ReproduceOptions) -> StudyPlan:
     chosen = choose_rows(chosen, tuple(split_name(text)[1] for text in options.recipes)) if options.recipes else chosen
     if not options.tables_only:
         check_folders(scenes)
-    shown = list_runs(chosen, scenes, options.seeds or (0,), scale)
+    held_out = hold_out_each(scenes, options.folds) if options.folds else scenes
+    shown = list_runs(chosen, held_out, options.seeds or (0,), scale)
     for spec in shown:
         check(spec.train)
     records, runs = options.records or options.out / "records", options.runs or options.out / "runs"
@@ -111,7 +113,7 @@ def written_command(options: ReproduceOptions, scenes: list[CaptureSpec]) -> str
     words = ["scene-experts", "reproduce", *options.experiments]
     if options.captures:
         words += ["--captures", *(shlex.quote(f"CAPTURES/{scene.name}") for scene in scenes)]
-    for name in ("scenes", "scale", "iterations", "resolution", "seeds", "recipes", "baseline"):
+    for name in ("scenes", "scale", "iterations", "resolution", "seeds", "folds", "recipes", "baseline"):
         value = getattr(options, name)
         if value != getattr(ReproduceOptions(()), name):
             words += [f"--{name}", *(shlex.quote(str(item)) for item in (value if isinstance(value, tuple) else [value]))]

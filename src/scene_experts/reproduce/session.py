@@ -12,6 +12,7 @@ from scene_experts.core.signals import handled
 from scene_experts.reproduce import report, store
 from scene_experts.reproduce.cluster import ClusterRunner
 from scene_experts.reproduce.experiments import EXPERIMENTS
+from scene_experts.reproduce.folds import join
 from scene_experts.reproduce.options import ReproduceOptions
 from scene_experts.reproduce.plan import Spec
 from scene_experts.reproduce.request import StudyPlan, make_plan, written_command
@@ -39,6 +40,7 @@ def reproduce(options: ReproduceOptions, say: Say) -> bool:
     runner = make_runner(options, plan, say, draw)
     failures = [] if options.tables_only else run_plan(runner, plan, options.out)
     found = store.find_all(store.load(plan.records), plan.shown)
+    found = join(found, options.folds) if options.folds else found
     for path in report.write(options.out, plan.experiments, plan.scenes, found, written_command(options, plan.scenes)):
         say(f"wrote {path}")
     if runner.stop.is_set():
@@ -64,7 +66,8 @@ def list_plan(plan: StudyPlan, say: Say) -> None:
     there = store.load(plan.records)
     done = [store.find(there, spec) is not None for spec in plan.wanted]
     for spec, is_done in zip(plan.wanted, done):
-        say(f"{'done   ' if is_done else 'to run '} {spec.label}: {spec.train.iterations:,} iterations, {spec.data.resolution}")
+        how = f"{spec.train.iterations:,} iterations, {spec.data.resolution}, {spec.data.split}"
+        say(f"{'done   ' if is_done else 'to run '} {spec.label}: {how}")
     say(f"{len(plan.wanted)} runs, {sum(done)} of them done")
 
 

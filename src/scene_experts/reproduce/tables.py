@@ -29,6 +29,8 @@ COLUMNS = {
     "psnr": Column("PSNR", 2, 1),
     "ssim": Column("SSIM", 3, 1),
     "lpips_3dgs": Column("LPIPS (3DGS)", 3, -1),
+    "lpips": Column("LPIPS", 3, -1),
+    "detail": Column("detail", 2, 1),
     "size_mb": Column("MB", 1, -1),
     "anchors": Column("anchors", 0, 0),
     "gaussians_rendered": Column("Gaussians drawn a view", 0, 0),

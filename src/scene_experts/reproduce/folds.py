@@ -1,0 +1,60 @@
+"""Folds: every photograph of a capture is held out once, and all of them are scored.
+
+A capture of 15 photographs holds out two, and their mean says little. With K folds, each run becomes
+K trainings; training k holds out every Kth view, beginning with the kth. Their records together are
+one record of the capture, with the scores of all views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from statistics import fmean
+from typing import Any
+
+from scene_experts.reproduce.plan import CaptureSpec
+from scene_experts.reproduce.store import MEANS, Record
+
+
+def split_of(fold: int, folds: int) -> str:
+    """Return the value of --split that holds out one fold, 1 to `folds`."""
+    return f"fold:{fold}/{folds}"
+
+
+def hold_out_each(scenes: Sequence[CaptureSpec], folds: int) -> list[CaptureSpec]:
+    """Return each capture once for each fold."""
+    splits = [split_of(fold, folds) for fold in range(1, folds + 1)]
+    return [replace(scene, options={**scene.options, "split": split}) for scene in scenes for split in splits]
+
+
+def join(records: Sequence[Record], folds: int) -> list[Record]:
+    """Return one record for the records of all folds of a training, with the scores of all views
+    and the means of other results. Trainings without one of their folds are left out."""
+    found: dict[tuple[str, str, int], dict[str, Record]] = {}
+    for record in records:
+        found.setdefault((record.scene, record.recipe, record.seed), {})[record.config.data.split] = record
+    wanted = [split_of(fold, folds) for fold in range(1, folds + 1)]
+    return [_join([by_split[split] for split in wanted]) for by_split in found.values() if all(split in by_split for split in wanted)]
+
+
+def _join(parts: Sequence[Record]) -> Record:
+    per_view = {name: scores for part in parts for name, scores in part.per_view.items()}
+    results = _average([part.results for part in parts]) | {"view_count": len(per_view)}
+    for metric in MEANS:
+        scores = [view[metric] for view in per_view.values() if metric in view]
+        results[metric] = fmean(scores) if len(scores) == len(per_view) else None
+    fits = [part.fit for part in parts if part.fit is not None]
+    return replace(parts[0], results=results, per_view=per_view, fit=fmean(fits) if len(fits) == len(parts) else None)
+
+
+def _average(values: Sequence[Any]) -> Any:
+    """Return the mean of JSON values: of each number that all have, and what is equal in all. Else
+    None."""
+    first = values[0]
+    if all(isinstance(value, dict) for value in values):
+        return {name: _average([value[name] for value in values]) for name in first if all(name in value for value in values)}
+    if all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values):
+        return fmean(values)
+    if all(isinstance(value, list) and len(value) == len(first) for value in values):
+        return [_average(each) for each in zip(*values)]
+    return first if all(value == first for value in values) else None
