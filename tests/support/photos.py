@@ -39,7 +39,7 @@ def fake_worker(**said):
     def reconstructed(request, log, say, progress):
         reconstructed.requests.append(request)
         model = Path(request["model"])
-        model.mkdir(parents=True)
+        model.mkdir(parents=True, exist_ok=True)
         (model / "cameras.bin").write_bytes(b"new")
         return {"step": "done", "version": "0", "registered": [], **said}
 

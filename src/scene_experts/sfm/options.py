@@ -25,7 +25,8 @@ class SfmOptions:
     segments is used."""
     matching: Matching = "auto"
     """Which photographs are matched. exhaustive: all pairs. sequential: neighbours in the order of
-    their names, as for a video or a walk. auto: exhaustive for up to 300 photographs."""
+    their names, as for a walk. auto: all pairs of up to 30 photographs; of more, each with those
+    that look like it and with its neighbours."""
     camera_model: CameraModel = "OPENCV"
     """COLMAP's lens model. Photographs of the same size, camera and focal length share one lens."""
     mapper: Mapper = "auto"

@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +26,11 @@ from scene_experts.data.readers import is_capture
 from scene_experts.native import library as native
 from scene_experts.sfm import frames, photos, work, worker
 from scene_experts.sfm.masks import write_masks
-from scene_experts.sfm.options import Matching, SfmOptions
+from scene_experts.sfm.options import SfmOptions
+from scene_experts.sfm.pairs import choose_pairs, find_alike
 from scene_experts.sfm.photos import Photo
 
 LOG, NOTE, VIDEO = "colmap.log", "capture.json", "video.txt"
-MOST_EXHAUSTIVE = 300  # photographs that are all matched with each other: 44,850 pairs, about ten minutes on two cores
-NEIGHBOURS = 10  # following photographs that each photograph is matched with
 
 Say = Callable[[str], None]
 
@@ -77,7 +75,9 @@ def reconstruct(
         names = [photo.name for photo in found]
         pairs = choose_pairs(len(names), options.matching)
         kind = "frames" if source.is_file() else "photographs"
-        say(f"{len(found)} {kind}, {len(groups)} camera{'s' if len(groups) > 1 else ''}, {len(pairs):,} pairs to match")
+        said = f"{len(found)} {kind}, {len(groups)} camera{'s' if len(groups) > 1 else ''}"
+        every = len(names) * (len(names) - 1) // 2
+        say(f"{said}, {len(pairs):,} pairs to match" if pairs is not None else said)
         masks = write_masks(found, images, folder / "masks")
         prepare_folder(folder, found, options, masks)
         request = {
@@ -87,7 +87,8 @@ def reconstruct(
             "maps": str(folder / "maps"),
             "model": str(folder / work.DONE / "model"),
             "groups": groups,
-            "pairs": [(names[i], names[j]) for i, j in pairs],
+            "pairs": None if pairs is None else [(names[i], names[j]) for i, j in pairs],
+            "spare": [],
             "threads": options.threads or native.count_cores(),
             "max_side": options.max_side,
             "camera_model": options.camera_model,
@@ -95,14 +96,19 @@ def reconstruct(
             "seed": options.seed,
         }
         began = time.monotonic()
+        if pairs is None:  # the features decide
+            run_worker(request, folder / LOG, say, progress)
+            pairs, spare = find_alike(Path(request["database"]), names)
+            say(f"{len(pairs):,} of {every:,} pairs to match: photographs that look alike, and each with those that follow it")
+            asked = {"pairs": pairs, "spare": spare}
+            request = {**request, **{name: [(names[i], names[j]) for i, j in some] for name, some in asked.items()}}
         result = run_worker(request, folder / LOG, say, progress)
         if not result["registered"]:
             raise InputError(
                 f"expected overlapping photographs of one scene in {source}, found none that fit together; take more sharp photographs "
                 f"from different places, each showing most of what the previous one shows (COLMAP's log: {folder / LOG})"
             )
-        exhaustive = len(pairs) == len(names) * (len(names) - 1) // 2
-        note = describe_result(result, found, options, time.monotonic() - began, copied=not own, exhaustive=exhaustive)
+        note = describe_result(result, found, options, time.monotonic() - began, copied=not own, exhaustive=len(pairs) == every)
         write_json(folder / work.DONE / NOTE, note)
         work.publish(out)
     shutil.rmtree(out / work.NAME, ignore_errors=True)
@@ -157,21 +163,6 @@ def extract_photos(video: Path, images: Path, options: SfmOptions, progress: Pro
     return photos.find_photos(images)
 
 
-def choose_pairs(count: int, matching: Matching = "auto", neighbours: int = NEIGHBOURS) -> list[tuple[int, int]]:
-    """Return the pairs (i, j), i < j, of `count` photographs in order that are matched with each
-    other.
-
-    "exhaustive": all pairs. "sequential": each photograph with its next `neighbours`, and with
-    those 16, 32, 64, ... further on, which closes loops. "auto": exhaustive up to MOST_EXHAUSTIVE
-    photographs, otherwise sequential.
-    """
-    if matching == "exhaustive" or (matching == "auto" and count <= MOST_EXHAUSTIVE):
-        return list(combinations(range(count), 2))
-    far = [1 << k for k in range(count.bit_length()) if 1 << k > neighbours]
-    steps = [*range(1, neighbours + 1), *far]
-    return [(i, i + step) for i in range(count) for step in steps if i + step < count]
-
-
 def prepare_folder(folder: Path, found: list[Photo], options: SfmOptions, masks: list[str]) -> None:
     """Empty the work folder for this request. The database is kept if it holds features of the same
     photographs and masks.
@@ -218,6 +209,8 @@ def run_worker(request: dict[str, Any], log: Path, say: Say, progress: Progress)
                     apart = f" in the largest of {last['parts']} parts, which do not fit together" if last["parts"] > 1 else ""
                     posed = f"gave {last['posed']} of {last['photographs']} photographs a pose{apart}"
                     say(f"the {last['mapper']} mapper {posed}; the global mapper runs too, and the better result is kept")
+                elif last["step"] == "weak":
+                    say(f"{last['photographs']} photographs fit too few others; {last['pairs']:,} more pairs are matched for them")
                 elif last["step"] == "unread":
                     say(f"warning: COLMAP cannot read {', '.join(last['names'])}")
             code = process.wait()

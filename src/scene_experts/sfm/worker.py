@@ -20,6 +20,7 @@ from typing import Any
 CHUNK = 8  # photographs per progress message during feature extraction
 PAIRS = 200  # pairs per progress message during matching
 ENOUGH = 0.9  # fraction of photographs with a pose at which the second mapper is not tried
+FEW_FITTING = 4  # other photographs that fit one
 FEW_FEATURES = 200  # a sharp photograph has thousands
 
 
@@ -69,11 +70,44 @@ def read_done(colmap: Any, database: str, names: list[str]) -> tuple[int | None,
     return camera, [name for name in names if name not in have]
 
 
-def match_pairs(colmap: Any, ask: dict[str, Any]) -> None:
-    """Match the pairs. COLMAP skips those that are done."""
+def match_all(colmap: Any, ask: dict[str, Any]) -> None:
+    """Match the pairs, then the spare pairs of photographs that fit too few others."""
+    match_pairs(colmap, ask, ask["pairs"])
+    if not ask["spare"]:
+        return
+    with colmap.Database.open(ask["database"]) as there:
+        names = {image.image_id: image.name for image in there.read_all_images()}
+        keys, inliers = there.read_two_view_geometry_num_inliers()
+    fitting = [[names[i] for i in colmap.pair_id_to_image_pair(key)] for key, count in zip(keys, inliers) if count]
+    weak = find_weak(list(names.values()), fitting)
+    more = [pair for pair in ask["spare"] if weak.intersection(pair)]
+    if more:
+        report(step="weak", photographs=len(weak), pairs=len(more))
+        match_pairs(colmap, ask, more)
+
+
+def find_weak(names: list[str], fitting: list[list[str]]) -> set[str]:
+    """Return the photographs that fit fewer than FEW_FITTING others, or that no chain of fitting
+    pairs connects with the largest number of photographs."""
+    beside: dict[str, set[str]] = {name: set() for name in names}
+    for one, other in fitting:
+        beside[one].add(other)
+        beside[other].add(one)
+    left, largest = set(names), set()
+    while left:
+        found, edge = set(), {next(iter(left))}
+        while edge:
+            found |= edge
+            edge = set().union(*(beside[name] for name in edge)) - found
+        left -= found
+        largest = max(largest, found, key=len)
+    return {name for name in names if len(beside[name]) < FEW_FITTING or name not in largest}
+
+
+def match_pairs(colmap: Any, ask: dict[str, Any], pairs: list[list[str]]) -> None:
+    """Match pairs. COLMAP skips those that are done."""
     options = colmap.FeatureMatchingOptions()
     options.num_threads, options.use_gpu = ask["threads"], False
-    pairs = ask["pairs"]
     report(step="matches", done=0, total=len(pairs))
     for first in range(0, len(pairs), PAIRS):
         some = pairs[first : first + PAIRS]
@@ -218,7 +252,11 @@ def main() -> int:
     threading.Thread(target=exit_with_parent, daemon=True).start()
     colmap.set_random_seed(ask["seed"])
     extract_features(colmap, ask)
-    match_pairs(colmap, ask)
+    if ask["pairs"] is None:  # asked for the features alone
+        report(step="done")
+        sys.stdout.flush()
+        os._exit(0)
+    match_all(colmap, ask)
     report(step="done", version=colmap.__version__, **estimate_poses(colmap, ask))
     sys.stdout.flush()
     os._exit(0)  # the waiting thread would delay the end of the interpreter

@@ -15,6 +15,7 @@ from PIL import Image
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.sfm import reconstruct as run
 from scene_experts.sfm.options import SfmOptions
+from scene_experts.sfm.pairs import MOST_EXHAUSTIVE
 from scene_experts.sfm.reconstruct import LOG, NOTE
 from scene_experts.sfm.work import NAME, PLACES
 from support.captures import load
@@ -235,18 +236,14 @@ def test_a_failed_worker_is_reported(tmp_path, monkeypatch, code, error, fact):
         run.run_worker({"threads": 1, "pairs": ["x" * 200] * 1000}, tmp_path / LOG, lambda _: None, lambda *_: None)
 
 
-def test_all_pairs_up_to_a_number_and_neighbours_beyond():
-    most = run.MOST_EXHAUSTIVE
-    assert len(run.choose_pairs(5)) == 10 and len(run.choose_pairs(most)) == most * (most - 1) // 2
-    assert len(run.choose_pairs(most + 1)) < 16 * most
-    assert run.choose_pairs(most + 1, "exhaustive")[-1] == (most - 1, most)
-
-
-@pytest.mark.parametrize("count", [1, 2, 11, 40])
-def test_sequential_is_the_next_ones_and_powers_of_two(count):
-    steps = {1, 2, 3, 4, 8, 16, 32}
-    expected = {(i, j) for i in range(count) for j in range(i + 1, count) if j - i in steps}
-    assert set(run.choose_pairs(count, "sequential", neighbours=3)) == expected
+def test_the_features_of_many_photographs_decide_which_are_matched(tmp_path, monkeypatch):
+    worker, said = fake_worker(**FOUND), []
+    monkeypatch.setattr(run, "run_worker", worker)
+    monkeypatch.setattr(run, "find_alike", lambda database, names: ([(0, 1), (1, 3)], [(2, 3)]))
+    note = run.reconstruct(write_black(tmp_path / "photos", MOST_EXHAUSTIVE + 1), tmp_path / "out", SfmOptions(), say=said.append)
+    first, second = worker.requests
+    assert first["pairs"] is None and not note["all_compared"] and any("2 of 465 pairs" in line for line in said)
+    assert second["pairs"] == [("0.jpg", "1.jpg"), ("1.jpg", "3.jpg")] and second["spare"] == [("2.jpg", "3.jpg")]
 
 
 def test_a_run_and_a_capture_are_no_folders_of_photographs(tmp_path):

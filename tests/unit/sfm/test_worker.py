@@ -5,7 +5,9 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -111,6 +113,45 @@ def test_why_a_photograph_has_no_pose():
         worker.explain(3000, {1: 40, 2: 20, 3: 99}, posed, False),
     ]
     assert len(set(words)) == 5 and "30 features" in words[0] and "2 photographs" in words[4] and "at most 40" in words[4]
+
+
+def test_photographs_that_fit_too_few_others_are_weak():
+    names = list("abcdefgh")
+    whole = [[one, other] for one in "abcde" for other in "abcde" if one < other]
+    apart = [[one, other] for one in "fgh" for other in "fgh" if one < other]
+    assert worker.find_weak(names, [*whole, *apart]) == set("fgh")
+    assert worker.find_weak(names, [*whole, *([n, m] for n in "fgh" for m in "abcd")]) == set()
+    assert worker.find_weak(names, [*whole, *([n, m] for n in "fgh" for m in "abc")]) == set("fgh")
+    assert worker.find_weak(["a", "b"], []) == {"a", "b"}
+
+
+def test_spare_pairs_are_matched_for_weak_photographs_alone(monkeypatch, capsys):
+    matched = []
+
+    class Database:
+        @staticmethod
+        @contextmanager
+        def open(path):
+            yield Database
+
+        @staticmethod
+        def read_all_images():
+            return [SimpleNamespace(image_id=i, name=name) for i, name in enumerate("abcdef")]
+
+        @staticmethod
+        def read_two_view_geometry_num_inliers():
+            pairs = [(i, j) for i in range(5) for j in range(i + 1, 5)]
+            return [*pairs, (0, 5)], [30] * len(pairs) + [0]
+
+    colmap = SimpleNamespace(Database=Database, pair_id_to_image_pair=lambda pair: pair)
+    monkeypatch.setattr(worker, "match_pairs", lambda colmap, ask, pairs: matched.append(pairs))
+    ask = {"database": "", "pairs": [["a", "b"]], "spare": [["a", "c"], ["b", "f"], ["e", "f"]]}
+    worker.match_all(colmap, ask)
+    assert matched == [[["a", "b"]], [["b", "f"], ["e", "f"]]]
+    assert json.loads(capsys.readouterr().out) == {"step": "weak", "photographs": 1, "pairs": 2}
+    matched.clear()
+    worker.match_all(None, {**ask, "spare": []})
+    assert matched == [[["a", "b"]]]
 
 
 def test_the_worker_ends_when_its_parent_ends(tmp_path):

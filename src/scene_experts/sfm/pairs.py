@@ -1,0 +1,51 @@
+"""Which photographs are matched with each other. Matching takes half a second of a core a pair, so
+all pairs of 128 photographs take more than an hour."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from pathlib import Path
+
+from scene_experts.sfm.options import Matching
+from scene_experts.sfm.retrieval import describe_photos, rank_alike
+
+MOST_EXHAUSTIVE = 30  # photographs that are all matched with each other
+NEIGHBOURS = 10  # following photographs that each photograph is matched with where the order alone decides
+ALIKE = 10  # photographs that each is matched with because they look alike: with 8, all 128 of South Building get poses
+FOLLOWING = 3  # and those that follow it in the order of the names
+SPARE = 20  # more that look alike, for photographs that fit too few others
+
+
+def choose_pairs(count: int, matching: Matching = "auto", neighbours: int = NEIGHBOURS) -> list[tuple[int, int]] | None:
+    """Return the pairs (i, j), i < j, of `count` photographs in order that are matched with each
+    other. None: their features decide (`find_alike`).
+
+    "exhaustive": all pairs. "sequential": each photograph with its next `neighbours`, and with
+    those 16, 32, 64, ... further on, which closes loops. "auto": exhaustive up to MOST_EXHAUSTIVE
+    photographs, otherwise None.
+    """
+    if matching == "exhaustive" or (matching == "auto" and count <= MOST_EXHAUSTIVE):
+        return list(combinations(range(count), 2))
+    if matching == "auto":
+        return None
+    far = [1 << k for k in range(count.bit_length()) if 1 << k > neighbours]
+    return follow(count, [*range(1, neighbours + 1), *far])
+
+
+def follow(count: int, steps: list[int]) -> list[tuple[int, int]]:
+    """Return the pairs of photographs that are one of `steps` apart."""
+    return [(i, i + step) for i in range(count) for step in steps if i + step < count]
+
+
+def find_alike(database: Path, names: list[str]) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+    """Return the pairs of photographs that are matched, and more pairs for those that fit too few
+    others.
+
+    Each photograph is matched with the ALIKE that look most like it and with the FOLLOWING next
+    ones.
+    """
+    ranks = rank_alike(describe_photos(database, names), ALIKE + SPARE)
+    ordered = lambda i, j: (min(i, j), max(i, j))  # noqa: E731
+    near = {ordered(i, int(j)) for i, row in enumerate(ranks) for j in row[:ALIKE]} | set(follow(len(names), [*range(1, FOLLOWING + 1)]))
+    more = {ordered(i, int(j)) for i, row in enumerate(ranks) for j in row[ALIKE:]}
+    return sorted(near), sorted(more - near)

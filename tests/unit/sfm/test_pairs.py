@@ -1,0 +1,29 @@
+"""Which photographs are matched."""
+
+import pytest
+
+from scene_experts.sfm import pairs
+
+
+def test_all_pairs_up_to_a_number_and_features_beyond():
+    most = pairs.MOST_EXHAUSTIVE
+    assert len(pairs.choose_pairs(5)) == 10 and len(pairs.choose_pairs(most)) == most * (most - 1) // 2
+    assert pairs.choose_pairs(most + 1) is None
+    assert pairs.choose_pairs(most + 1, "exhaustive")[-1] == (most - 1, most)
+
+
+@pytest.mark.parametrize("count", [1, 2, 11, 40])
+def test_sequential_is_the_next_ones_and_powers_of_two(count):
+    steps = {1, 2, 3, 4, 8, 16, 32}
+    expected = {(i, j) for i in range(count) for j in range(i + 1, count) if j - i in steps}
+    assert set(pairs.choose_pairs(count, "sequential", neighbours=3)) == expected
+
+
+def test_photographs_are_matched_with_those_like_them_and_with_the_next_ones(monkeypatch):
+    ranks = [[(i + step) % 50 for step in (25, 24, *range(1, 24), *range(26, 31))] for i in range(50)]
+    monkeypatch.setattr(pairs, "describe_photos", lambda database, names: names)
+    monkeypatch.setattr(pairs, "rank_alike", lambda vectors, count: ranks)
+    near, spare = pairs.find_alike(None, ["photo"] * 50)
+    assert {(0, 25), (0, 24), (0, 1), (0, 2), (0, 3), (48, 49)} <= set(near) and (0, 12) in spare
+    assert near == sorted(set(near)) and not set(near) & set(spare) and all(i < j for i, j in [*near, *spare])
+    assert len(near) <= 50 * (pairs.ALIKE + pairs.FOLLOWING)
