@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from scene_experts.api.trainer import train as train
     from scene_experts.core.errors import InputError as InputError
     from scene_experts.core.errors import RunError as RunError
+    from scene_experts.making.make import MadeScene as MadeScene
+    from scene_experts.making.make import make as make
     from scene_experts.training.events import Densified as Densified
     from scene_experts.training.events import Event as Event
     from scene_experts.training.events import Exported as Exported
@@ -60,6 +62,7 @@ __all__ = [
     "Finished",
     "InputError",
     "Layers",
+    "MadeScene",
     "Previewed",
     "Recipe",
     "Run",
@@ -74,6 +77,7 @@ __all__ = [
     "import_run",
     "list_recipes",
     "load_capture",
+    "make",
     "open_run",
     "recipe",
     "train",
@@ -86,6 +90,7 @@ _MODULES = {
     "api.run": ("Layers", "Run", "Scores", "import_run", "open_run"),
     "api.trainer": ("Trainer", "train"),
     "core.errors": ("InputError", "RunError"),
+    "making.make": ("MadeScene", "make"),
     "training.events": ("Densified", "Event", "Exported", "Finished", "Previewed", "Saved", "Started", "Stepped", "Stopped"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

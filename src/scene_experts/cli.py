@@ -16,7 +16,7 @@ from scene_experts.commands import COMMANDS, PROG
 from scene_experts.core.errors import InputError, RunError, nearest
 from scene_experts.core.reading.source import sentence
 
-SLOW = ("capture", "train", "eval", "render", "view", "export", "import")
+SLOW = ("make", "capture", "train", "eval", "render", "view", "export", "import")
 """Commands that load torch before their first line."""
 
 

@@ -181,7 +181,7 @@ def test_the_switches_that_scene_experts_does_not_use():
     sizes = cells_of("means over fox, colosseum", page)
     for name in ("average", "absolute gradients", "error views", "masks", "residuals", "later growth", "smoothing"):
         written = next(line for line in lines(OURS) if line.startswith(f"| {name} (`--"))
-        size, drawn = (sizes[name][i].strip("*") for i in (3, 6))
+        size, drawn = (sizes[name][i].strip("*") for i in (3, 7))
         assert written.endswith(row(*psnr[name][:3], lpips[name][2], size, drawn)[1:]), name
 
 

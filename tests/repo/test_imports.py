@@ -19,6 +19,7 @@ LAYERS = [
     {"view", "report", "reproduce"},
     {"files"},
     {"api"},
+    {"making"},
     {"commands"},
     {"cli"},
     {"__main__", "__init__"},  # the package names its public API

@@ -26,6 +26,7 @@ SIDES = ((0, 7000), (1200, 7000), (800, 7000), (800, 4000), (600, 4000), (600, 3
 # 5.7, 7.6 and 15.1 times the picture below. The line is near the first and the last, and above the
 # others.
 FEW, FEW_ITERATIONS = 30, 4000
+FEW_FOR_EXPERTS = 46
 BASE, PER_MEGAPIXEL = 4.5, 9.8
 SERIAL = 0.15  # share of an iteration that one thread does
 
@@ -80,9 +81,15 @@ def estimate_minutes(width: int, height: int, iterations: int, picture: float, t
     return iterations * picture * (BASE + PER_MEGAPIXEL * width * height / 1e6) / gain / 60
 
 
-def suggest(width: int, height: int, views: int, picture: float | None = None) -> Advice:
+def choose_recipe(views: int) -> str:
+    """Return the recipe for this number of photographs: with fewer than FEW_FOR_EXPERTS,
+    `scene-experts` gives softer pictures than `scaffold-gs`."""
+    return "scaffold-gs" if views < FEW_FOR_EXPERTS else "scene-experts"
+
+
+def suggest(width: int, height: int, views: int, picture: float | None = None, limit: float | None = None) -> Advice:
     """Suggest a training for photographs of this size: the best one of SIDES that takes at most
-    LIMIT minutes, or the shortest.
+    `limit` minutes (by default LIMIT), or the shortest.
 
     With FEW photographs or less, at most FEW_ITERATIONS: a longer training fits them better and
     what lies between them worse.
@@ -101,6 +108,6 @@ def suggest(width: int, height: int, views: int, picture: float | None = None) -
         scale = side / max(width, height) if side else min(1.0, 1600 / width)  # `train` limits the width to 1,600 px
         minutes = estimate_minutes(round(width * scale), round(height * scale), iterations, picture, threads)
         advice = Advice(side, iterations, minutes)
-        if minutes <= LIMIT:
+        if minutes <= (LIMIT if limit is None else limit):
             break
     return advice

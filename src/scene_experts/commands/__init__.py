@@ -9,6 +9,7 @@ from scene_experts.core.signals import follow_parent
 PROG = "scene-experts"
 
 COMMANDS: dict[str, tuple[str, str]] = {
+    "make": ("make:make", "Make a web page with a 3D scene from photographs or a video"),
     "capture": ("capture:capture", "Find camera poses and 3D points for photographs or a video"),
     "info": ("inspect:info", "Show what a capture contains"),
     "train": ("train:train", "Train a scene on a capture"),

@@ -7,8 +7,6 @@ import shlex
 from scene_experts.commands import PROG
 from scene_experts.data.settings import Data
 
-FEW = 46  # with fewer photographs, scene-experts gives softer pictures than scaffold-gs
-
 
 def propose_training(data: Data, width: int, height: int, views: int) -> str:
     """Return a command that trains on `views` photographs of this size, read as `data` says, with
@@ -17,12 +15,12 @@ def propose_training(data: Data, width: int, height: int, views: int) -> str:
     The resolution is the one that is estimated, not that of `data`.
     """
     from scene_experts.api.command_line import changes, words_of
-    from scene_experts.bench.advice import suggest
+    from scene_experts.bench.advice import choose_recipe, suggest
     from scene_experts.data.fetch.catalog import defaults_of
 
     plain = Data(data.path, resolution=data.resolution, normalise=defaults_of(data.path).normalise)
     read = [word for place, value in changes(plain, data) or [] for word in words_of(place, value)]
     advice = suggest(width, height, views)
-    recipe = "scaffold-gs" if views < FEW else "scene-experts"
+    recipe = choose_recipe(views)
     time = f"  # {advice}" if str(advice) else ""
     return f"next: {shlex.join([PROG, 'train', recipe, '--data', str(data.path), '--out', 'RUN', *read, *advice.flags])}{time}"

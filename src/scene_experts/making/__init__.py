@@ -1,0 +1,1 @@
+"""From photographs to a page in one call."""

@@ -1,0 +1,105 @@
+"""Divides the minutes of a whole call among its stages, and adapts to how fast the machine is."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+from scene_experts.bench.advice import FEW, Advice, suggest
+from scene_experts.core.progress import Progress
+from scene_experts.training.progress import format_duration
+
+FOR_PAGE = 0.2  # share of the time after the poses that the page gets
+LEAST_PAGE, MOST_PAGE = 10.0, 240.0  # seconds of it
+FOR_SCORES = 0.15  # the same for the scores, where they are asked for
+GROWTH = 1.7
+"""Time of a whole training over ten times that of its first tenth: a scene grows. 1.3 to 2.6 in eight
+trainings of 4,000 iterations on banana, brighton, fern and kitchen."""
+LOOK = 0.1  # share of the iterations after which the speed is known
+CLOSE = (0.8, 1.3)  # a training whose time will be this share of what it has is not begun anew
+LEAST, MOST, MOST_OF_FEW = 300, 30_000, 7_000  # iterations; the last with few photographs (`bench.advice.FEW`)
+PAGE_GUESS = 60.0  # seconds, before anything is known
+LEAST_REFINE, MOST_REFINE = 0, 1000  # iterations that fit the page's Gaussians
+
+
+@dataclass(frozen=True)
+class TimeBudget:
+    """Seconds for the whole; None: no limit."""
+
+    seconds: float | None = None
+    now: Callable[[], float] = time.monotonic
+    began: float = field(default=-1.0)
+
+    def __post_init__(self) -> None:
+        if self.began < 0:
+            object.__setattr__(self, "began", self.now())
+
+    @property
+    def left(self) -> float | None:
+        """Seconds that are left, at least 0; None without a limit."""
+        return None if self.seconds is None else max(0.0, self.began + self.seconds - self.now())
+
+    def for_training(self, scores: bool) -> float | None:
+        """Seconds that the training may take from now on."""
+        left = self.left
+        if left is None:
+            return None
+        page = min(max(FOR_PAGE * left, LEAST_PAGE), MOST_PAGE)
+        return max(0.0, left - page - (FOR_SCORES * left if scores else 0.0))
+
+
+class Whole:
+    """Tells how long the whole will still take, from the speed of its present stage and what the
+    later stages are expected to take."""
+
+    def __init__(self, progress: Progress, now: Callable[[], float] = time.monotonic) -> None:
+        self.progress, self.now = progress, now
+        self.later = 0.0  # seconds of the stages after this one
+        self.what, self.began, self.first = "", now(), 0
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        """Show that `done` of `total` parts of the work `what` are done."""
+        if what != self.what:
+            self.what, self.began, self.first = what, self.now(), done
+        parts, elapsed = done - self.first, self.now() - self.began
+        if parts <= 0 or total <= 0:
+            self.progress(what, done, total)
+            return
+        left = elapsed / parts * max(0, total - done) + self.later
+        self.progress(f"{what} (about {format_duration(left)} left in all)", done, total)
+
+
+def plan_training(width: int, height: int, views: int, have: float | None, slow: float = 1.0) -> Advice:
+    """Return a training for photographs of this size that takes `have` seconds; None: what `suggest`
+    proposes.
+
+    slow: How many times longer than estimated this machine takes.
+    """
+    limit = None if have is None else have / 60 / slow
+    advice = suggest(width, height, views, limit=limit)
+    if limit is None or advice.minutes is None:
+        return advice
+    most = MOST_OF_FEW if views <= FEW else MOST
+    iterations = min(max(round(advice.iterations * limit / advice.minutes), LEAST), most)
+    return replace(advice, iterations=iterations, minutes=advice.minutes * iterations / advice.iterations)
+
+
+def find_slowness(iterations: int, step: int, seconds: float, minutes: float | None, have: float) -> float | None:
+    """Return how many times longer than the estimated minutes a training of `iterations` will take,
+    from the seconds of its first `step`. None where it will take about what it has."""
+    expected = seconds / max(step, 1) * iterations * GROWTH
+    if CLOSE[0] <= expected / max(have, 1e-9) <= CLOSE[1]:
+        return None
+    return expected / 60 / minutes if minutes else expected / max(have, 1e-9)
+
+
+def choose_refinement(left: float | None, iteration: float, base: float) -> int:
+    """Return the iterations that fit a page's Gaussians to the scene, for the seconds that are left.
+
+    iteration: Seconds of one iteration of the training at its end. base: Seconds of the page without
+    any.
+    """
+    if left is None:
+        return MOST_REFINE
+    return min(max(int((left - base) / max(iteration, 1e-9)), LEAST_REFINE), MOST_REFINE)

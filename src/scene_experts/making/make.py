@@ -1,0 +1,206 @@
+"""`make`: photographs or a video to a page: poses, training, scores, page, report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from statistics import fmean
+from time import monotonic
+from typing import Any
+
+from scene_experts.api.capture import Capture, load_capture
+from scene_experts.api.recipe import Recipe, recipe
+from scene_experts.api.run import Run
+from scene_experts.api.trainer import Trainer
+from scene_experts.bench.advice import LIMIT, choose_recipe
+from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.progress import Progress
+from scene_experts.data.readers import is_capture
+from scene_experts.files.export import export_several
+from scene_experts.files.options import Options
+from scene_experts.making.budget import LOOK, PAGE_GUESS, TimeBudget, Whole, choose_refinement, find_slowness, plan_training
+from scene_experts.sfm.options import SfmOptions
+from scene_experts.sfm.reconstruct import reconstruct
+from scene_experts.training import run_folder
+from scene_experts.training.events import Stepped
+
+CAPTURE, RUN, PAGE = "capture", "run", "scene.html"
+RECENT = 200  # iterations whose time counts as that of one at the end
+PER_VIEW = 0.2  # seconds of a page for each training view, without refinement
+
+
+@dataclass(frozen=True)
+class MadeScene:
+    """What was made, and where it is."""
+
+    page: Path
+    """One HTML file that shows the scene in any browser."""
+    run: Path
+    """The run folder, for `open_run` and every command."""
+    capture: Path
+    """The photographs with their poses."""
+    report: Path | None
+    """A page with scores and curves; None unless scores were asked for."""
+    psnr: float | None
+    """PSNR in dB: of the held-out views if scores were asked for, else of the last training
+    views."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Wall time by stage: poses, training, scores, page. 0 for what was there already."""
+
+
+def make(
+    source: str | Path,
+    out: str | Path | None = None,
+    *,
+    minutes: float | None = None,
+    scores: bool = False,
+    say: Callable[[str], None] = print,
+    progress: Progress = lambda what, done, total: None,
+) -> MadeScene:
+    """Make a page with a 3D scene from photographs or a video.
+
+    A call that was interrupted is continued by the same call.
+
+    Args:
+        source: Folder of photographs, a video, or a capture.
+        out: Folder to write. Default: the name of the source with "-scene", in this folder.
+        minutes: Time for the whole, above 0. It decides iterations, resolution and effort; poses
+            take what they take. Default: what `info` proposes.
+        scores: Hold out every 8th photograph and score it. Default: train on all of them.
+        say: Called with each message.
+        progress: Called with the name of the work, how much is done and how much there is.
+
+    Returns:
+        What was made.
+
+    Raises:
+        InputError: The photographs cannot be used, or `out` holds something else.
+        RunError: COLMAP fails, a loss is not finite, or a file cannot be written.
+    """
+    if minutes is not None and not minutes > 0:
+        raise InputError(f"expected minutes above 0, found {minutes}; give for example 10")
+    budget, source = TimeBudget(None if minutes is None else 60 * minutes), Path(source)
+    folder = Path(out) if out is not None else Path(f"{source.resolve().stem}-scene")
+    took: dict[str, float] = {}
+    show, began = Whole(progress), monotonic()
+    show.later = PAGE_GUESS + 60 * LIMIT if minutes is None else 60 * minutes
+    place = find_poses(source, folder, say, show)
+    took["poses"] = monotonic() - began
+    plan = prepare(place, folder / RUN, budget, scores, say)
+    show.later, began = PAGE_GUESS if budget.left is None else budget.left - (budget.for_training(scores) or 0.0), monotonic()
+    run, psnr, iteration = train(plan, folder / RUN, budget, scores, show)
+    views = len(plan.capture.train_cameras)
+    took["training"] = monotonic() - began
+    report, began, show.later = None, monotonic(), 0.0
+    if scores:
+        show("scores", 0, len(plan.capture.test_cameras))
+        psnr = run.evaluate(lpips=True).psnr
+        report = run.report()
+    took["scores"] = monotonic() - began
+    began = monotonic()
+    refine = choose_refinement(budget.left, iteration, PER_VIEW * views)
+    page = write_page(folder, Options(measure=False, refine=refine, title=source.resolve().stem), show)
+    took["page"] = monotonic() - began
+    return MadeScene(page, folder / RUN, place, report, psnr, took)
+
+
+def find_poses(source: Path, folder: Path, say: Callable[[str], None], progress: Progress) -> Path:
+    """Return the capture: the source if it is one, or that of an earlier call, or a new one."""
+    if source.is_dir() and is_capture(source):
+        return source
+    place = folder / CAPTURE
+    if is_capture(place):
+        say(f"poses: those in {place}")
+        return place
+    note = reconstruct(source, place, SfmOptions(), say=say, progress=progress)
+    say(f"poses: {note['with_pose']} of {note['photographs']} photographs, {note['points']:,} points")
+    return place
+
+
+@dataclass(frozen=True)
+class TrainingPlan:
+    """What is trained."""
+
+    place: Path
+    split: str
+    size: tuple[int, int]  # of the whole photographs, px
+    capture: Capture
+    recipe: Recipe
+    minutes: float | None = None  # as estimated
+    begun: bool = False  # by an earlier call
+
+    def fit(self, have: float | None, slow: float = 1.0) -> TrainingPlan:
+        """Return the plan for `have` seconds on a machine that takes `slow` times the estimate."""
+        views = len(self.capture.train_cameras)
+        advice = plan_training(*self.size, views, have, slow)
+        resolution = f"longest:{advice.side}" if advice.side else "auto"
+        capture = load_capture(self.place, split=self.split, resolution=resolution)
+        return replace(self, capture=capture, recipe=recipe(choose_recipe(views), iterations=advice.iterations), minutes=advice.minutes)
+
+
+def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Callable[[str], None]) -> TrainingPlan:
+    """Return what is trained: a run that has begun, or what fits the budget.
+
+    Raises InputError if the run in the folder was begun with other photographs held out.
+    """
+    split = "mod8" if scores else "none"
+    if (folder / "config.json").is_file():
+        begun = run_folder.read_config(folder)
+        if (begun.data.split == "none") is scores:
+            told = "none was" if begun.data.split == "none" else f"{begun.data.split} was"
+            raise InputError(f"expected a run with the same photographs held out in {folder}, found one where {told}; choose another --out")
+        say(f"training: continues that in {folder}")
+        capture = load_capture(place, split=split, resolution=begun.data.resolution, seed=begun.train.seed)
+        return TrainingPlan(place, split, (0, 0), capture, begun.train, begun=True)
+    whole = load_capture(place, split=split)
+    lens = whole.cameras[0]
+    plan = TrainingPlan(place, split, (lens.width, lens.height), whole, recipe("scaffold-gs")).fit(budget.for_training(scores))
+    held = f", {len(whole.test_cameras)} held out" if scores else ""
+    about = "" if plan.minutes is None else f", about {max(1, round(plan.minutes))} min if the machine is not busy"
+    say(f"training: {plan.recipe.recipe}, {plan.recipe.iterations:,} iterations on {len(whole.train_cameras)} photographs{held}{about}")
+    return plan
+
+
+def train(plan: TrainingPlan, folder: Path, budget: TimeBudget, scores: bool, progress: Progress) -> tuple[Run, float | None, float]:
+    """Train. Where the first tenth shows that the machine is slower or faster than estimated, the
+    training begins anew, once, with what fits the time.
+
+    Returns the run, the mean PSNR of the last training views, and the seconds of an iteration at
+    the end.
+    """
+    settled = plan.begun
+    while True:
+        have, slow = budget.for_training(scores), None
+        trainer = Trainer(plan.recipe, plan.capture, folder, resume=plan.begun, overwrite=not plan.begun, preview_every=0)
+        recent: list[Stepped] = []
+        for event in trainer:
+            if not isinstance(event, Stepped):
+                continue
+            progress("training", event.step, plan.recipe.iterations)
+            recent = [*(one for one in recent if event.step - one.step <= RECENT), event]
+            if not settled and have is not None and event.step >= LOOK * plan.recipe.iterations:
+                settled = True
+                slow = find_slowness(plan.recipe.iterations, event.step, event.seconds, plan.minutes, have)
+                if slow is not None:
+                    trainer.stop("another training fits the time")
+        if slow is None:
+            break
+        plan = plan.fit(budget.for_training(scores), slow)
+    psnr = fmean(one.psnr for one in recent) if recent else None
+    steps = recent[-1].step - recent[0].step if recent else 0
+    iteration = (recent[-1].seconds - recent[0].seconds) / steps if steps else 0.1
+    return trainer.run, psnr, iteration
+
+
+def write_page(folder: Path, options: Options, progress: Progress) -> Path:
+    """Write the page, unless a page of this run is there."""
+    run, page = folder / RUN, folder / PAGE
+    newest = max(path.stat().st_mtime for path in (run / "checkpoints").glob("ckpt_*.safetensors"))
+    if page.is_file() and page.stat().st_mtime > newest:
+        return page
+    opened: Any = run_folder.open_run(run)
+    written = export_several(opened, ("html",), page, options, tell=progress)
+    if not written:
+        raise RunError(f"expected a page at {page}, found none written; repeat the command")
+    return page

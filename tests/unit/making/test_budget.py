@@ -1,0 +1,80 @@
+"""How the minutes of a call are divided, and what is told about the time left."""
+
+import pytest
+
+from scene_experts.bench import advice
+from scene_experts.making.budget import (
+    GROWTH,
+    LEAST,
+    LEAST_PAGE,
+    MOST,
+    MOST_OF_FEW,
+    MOST_REFINE,
+    TimeBudget,
+    Whole,
+    choose_refinement,
+    find_slowness,
+    plan_training,
+)
+
+
+class Clock:
+    def __init__(self):
+        self.time = 100.0
+
+    def __call__(self):
+        return self.time
+
+
+def test_the_training_gets_what_page_and_scores_leave():
+    clock = Clock()
+    budget = TimeBudget(600.0, clock)
+    clock.time += 100.0
+    assert budget.left == pytest.approx(500) and budget.for_training(False) == pytest.approx(400)
+    assert budget.for_training(True) == pytest.approx(325)
+    clock.time += 490.0
+    assert budget.for_training(False) == pytest.approx(10 - LEAST_PAGE)
+    clock.time += 1000.0
+    assert budget.left == 0 and budget.for_training(True) == 0
+    free = TimeBudget(None, clock)
+    assert free.left is None and free.for_training(True) is None and choose_refinement(None, 1.0, 1.0) == MOST_REFINE
+
+
+def test_a_training_fills_the_time_that_it_has(monkeypatch):
+    monkeypatch.setattr(advice, "recall_picture", lambda: 0.015)
+    monkeypatch.setattr(advice.gsplat_install, "is_likely", lambda: False)
+    short, long = plan_training(1200, 800, 40, 60.0), plan_training(1200, 800, 40, 3600.0)
+    assert short.minutes == pytest.approx(1.0, rel=0.01) and long.minutes == pytest.approx(60.0, rel=0.01)
+    assert 0 < short.side < 1200 and long.side == 0 and long.iterations > short.iterations
+    slow = plan_training(1200, 800, 40, 600.0, slow=4.0)
+    assert slow == plan_training(1200, 800, 40, 150.0)
+    assert plan_training(1200, 800, 40, 0.0).iterations == LEAST and plan_training(1200, 800, 40, 1e9).iterations == MOST
+    assert plan_training(1200, 800, 12, 1e9).iterations == MOST_OF_FEW
+    assert plan_training(1200, 800, 40, None) == advice.suggest(1200, 800, 40)
+
+
+def test_how_slow_the_machine_is_follows_from_the_first_iterations():
+    fits = 400 * 0.1 * GROWTH  # seconds of 400 iterations, of which 40 took 4
+    assert find_slowness(400, 40, 4.0, 1.0, fits) is None and find_slowness(400, 40, 4.0, 1.0, 1.1 * fits) is None
+    assert find_slowness(400, 40, 4.0, fits / 60 / 3, fits / 2) == pytest.approx(3)
+    assert find_slowness(400, 40, 4.0, None, fits / 2) == pytest.approx(2) and find_slowness(400, 40, 4.0, 1.0, 3 * fits) is not None
+
+
+def test_the_page_is_refined_as_long_as_time_is_left():
+    assert choose_refinement(60.0, 0.1, 10.0) == 500 and choose_refinement(1e6, 0.1, 10.0) == MOST_REFINE
+    assert choose_refinement(5.0, 0.1, 10.0) == 0
+
+
+def test_the_time_left_is_that_of_the_stage_and_of_those_after_it():
+    clock, told = Clock(), []
+    whole = Whole(lambda *what: told.append(what), clock)
+    whole.later = 120.0
+    whole("features", 0, 40)
+    clock.time += 10.0
+    whole("features", 10, 40)
+    assert told[0] == ("features", 0, 40) and told[1] == ("features (about 2:30 left in all)", 10, 40)
+    whole("matches", 30, 40)  # a stage that goes on: what was done before says nothing of its speed
+    clock.time += 5.0
+    whole.later = 0.0
+    whole("matches", 35, 40)
+    assert told[2][0] == "matches" and told[3][0] == "matches (about 0:05 left in all)"

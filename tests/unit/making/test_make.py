@@ -1,0 +1,131 @@
+"""A page from photographs: which stages run, with what, and what a repeated call does."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+from scene_experts.bench.advice import Advice
+from scene_experts.core.errors import InputError
+from scene_experts.making import make as making
+from scene_experts.making.make import make
+from scene_experts.training.events import Stepped
+from support.messages import naming
+from support.synthetic import make_capture
+
+
+def stepped(step, seconds):
+    return Stepped(step, {}, 25.0, 10, 10, 10, 1.0, seconds, {})
+
+
+@pytest.fixture
+def capture(tmp_path):
+    return make_capture(tmp_path / "box", views=9, size=(48, 32), points=200).folder
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """Trainings that take `seconds` an iteration and write nothing but a checkpoint's name; returns them."""
+    made = []
+
+    class Trainer:
+        seconds = 0.01
+
+        def __init__(self, recipe, capture, folder, resume, overwrite, preview_every):
+            self.recipe, self.capture, self.folder, self.stopped = recipe, capture, folder, False
+            self.resume, self.run = (
+                resume,
+                SimpleNamespace(evaluate=lambda lpips: SimpleNamespace(psnr=21.0), report=lambda: folder / "r.html"),
+            )
+            made.append(self)
+
+        def __iter__(self):
+            for step in range(10, self.recipe.iterations + 1, 10):
+                yield stepped(step, step * self.seconds)
+                if self.stopped:
+                    return
+            if not self.resume:
+                (self.folder / "checkpoints").mkdir(parents=True, exist_ok=True)
+                (self.folder / "checkpoints" / "ckpt_1.safetensors").touch()
+
+        def stop(self, reason):
+            self.stopped = True
+
+    def export(opened, formats, page, options, tell):
+        page.write_text(json.dumps({"refine": options.refine, "title": options.title}))
+        return [page]
+
+    monkeypatch.setattr(making, "Trainer", Trainer)
+    monkeypatch.setattr(making, "export_several", export)
+    monkeypatch.setattr(making.run_folder, "open_run", lambda folder: None)
+    plan = lambda width, height, views, have, slow=1.0: Advice(0, 1000 if have is None or slow == 1 else round(have / slow * 10), 1.0)  # noqa: E731
+    monkeypatch.setattr(making, "plan_training", plan)
+    return SimpleNamespace(made=made, Trainer=Trainer)
+
+
+def test_all_photographs_are_trained_on_and_a_page_is_written(capture, tmp_path, trained):
+    said = []
+    made = make(capture, tmp_path / "out", say=said.append)
+    (one,) = trained.made
+    assert len(one.capture.train_cameras) == 9 and one.recipe.recipe == "scaffold-gs" and one.recipe.iterations == 1000
+    assert made.page == tmp_path / "out" / "scene.html" and json.loads(made.page.read_text()) == {"refine": 1000, "title": "box"}
+    assert (
+        made.report is None
+        and made.psnr == 25.0
+        and made.capture == capture
+        and set(made.seconds) == {"poses", "training", "scores", "page"}
+    )
+
+
+def test_scores_are_those_of_photographs_held_out(capture, tmp_path, trained):
+    made = make(capture, tmp_path / "out", scores=True, say=lambda _: None)
+    assert len(trained.made[0].capture.test_cameras) == 2 and made.psnr == 21.0 and made.report is not None
+
+
+def test_a_training_that_would_not_fit_begins_anew_with_other_iterations(capture, tmp_path, trained):
+    trained.Trainer.seconds = 0.1  # 1,000 iterations would take 170 s with growth
+    make(capture, tmp_path / "out", minutes=1.5, say=lambda _: None)
+    first, second = trained.made
+    assert first.stopped and not second.stopped
+    assert second.recipe.iterations == pytest.approx(72 / (170 / 60) * 10, rel=0.02)  # a fifth of 90 s is the page's; 170 s for 1 min
+
+
+def test_a_repeated_call_continues_the_training_and_keeps_the_page(capture, tmp_path, trained, monkeypatch):
+    made = make(capture, tmp_path / "out", say=lambda _: None)
+    begun = SimpleNamespace(data=SimpleNamespace(split="none", resolution="auto"), train=replace(trained.made[0].recipe, iterations=500))
+    (made.run / "config.json").touch()
+    monkeypatch.setattr(making.run_folder, "read_config", lambda folder: begun)
+    made.page.write_text("mine")
+    make(capture, tmp_path / "out", say=lambda _: None)
+    assert trained.made[1].resume and trained.made[1].recipe.iterations == 500 and made.page.read_text() == "mine"
+    with pytest.raises(InputError, match=naming(made.run)):
+        make(capture, tmp_path / "out", scores=True, say=lambda _: None)
+
+
+def test_photographs_get_poses_first(tmp_path, capture, trained, monkeypatch):
+    asked = []
+
+    def reconstruct(source, out, options, say, progress):
+        asked.append(out)
+        make_capture(out, views=9, size=(48, 32), points=200)
+        return {"with_pose": 9, "photographs": 9, "points": 200}
+
+    monkeypatch.setattr(making, "reconstruct", reconstruct)
+    (tmp_path / "photos").mkdir()
+    for _ in range(2):
+        made = make(tmp_path / "photos", tmp_path / "out", say=lambda _: None)
+    assert asked == [tmp_path / "out" / "capture"] and made.capture == asked[0]
+
+
+def test_no_time_is_no_budget(tmp_path):
+    with pytest.raises(InputError, match="minutes"):
+        make(tmp_path, minutes=0.0)
+
+
+@pytest.mark.slow
+def test_a_real_page_is_made_within_its_time(capture, tmp_path):
+    made = make(capture, tmp_path / "out", minutes=0.5, say=lambda _: None)
+    assert made.page.stat().st_size > 100_000 and made.psnr > 15
+    again = make(capture, tmp_path / "out", minutes=0.5, say=lambda _: None)
+    assert again.page == made.page and again.seconds["page"] < 1
