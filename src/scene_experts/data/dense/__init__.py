@@ -105,7 +105,8 @@ def sweep_views(capture: Capture, own: Cloud) -> DepthMaps:
     pairs = choose_pairs(pictures, own.xyz, COMPARED)
     if pairs.swept < FEWEST:
         raise InputError(
-            f"expected at least {FEWEST} training views for --init dense that each overlap with two others, found {pairs.swept}; {_OTHERWISE}"
+            f"expected at least {FEWEST} training views that each overlap with two others for --init dense, found {pairs.swept}; "
+            + _OTHERWISE
         )
     maps = DepthMaps(pictures, pairs, PLANES)
     maps.keep_confirmed()

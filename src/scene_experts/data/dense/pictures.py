@@ -13,7 +13,7 @@ from torch import Tensor
 from scene_experts.core.types import Camera
 from scene_experts.data.views import Capture
 
-LEAST = 16  # px of the shorter side; the windows of the sweep have 7
+LEAST = 16  # px of the shorter side that are left; the windows of the sweep have 7
 UNCOUNTED = -1000.0  # grey level of a pixel that a mask leaves out
 _AHEAD = 4  # photographs that are decoded ahead
 _GREY = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # luma of ITU-R BT.601
@@ -100,7 +100,7 @@ def reduce_pictures(capture: Capture, side: int) -> Reduced:
 
 
 def _reduced_size(camera: Camera, side: int) -> tuple[int, int]:
-    scale = min(1.0, side / max(camera.width, camera.height), max(1.0, min(camera.width, camera.height) / LEAST))
+    scale = min(1.0, max(side / max(camera.width, camera.height), LEAST / min(camera.width, camera.height)))
     return max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
 
 
