@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from scene_experts.data.dense.pairs import Pairs
-from scene_experts.data.dense.pictures import Reduced
+from scene_experts.data.dense.pictures import SmallPictures
 from scene_experts.data.lens import Lens
 from scene_experts.data.readers.colmap_model import ColmapImage, Model, write_model
 from support.synthetic import quaternion
@@ -88,7 +88,7 @@ def look(shape: Shape, world_to_cam: Array, size: tuple[int, int], focal: float)
     return out[0][0], out[1][1]
 
 
-def reduced(shape: Shape, cameras: list[Array], size: tuple[int, int] = (48, 36), focal: float = 48.0) -> tuple[Reduced, list[Array]]:
+def reduced(shape: Shape, cameras: list[Array], size: tuple[int, int] = (48, 36), focal: float = 48.0) -> tuple[SmallPictures, list[Array]]:
     """Return the views of a shape as the sweep takes them, and their depths [H, W]."""
     seen = [look(shape, camera, size, focal) for camera in cameras]
     grey = torch.from_numpy(np.concatenate([picture.ravel() for picture, _ in seen])).float()
@@ -96,7 +96,7 @@ def reduced(shape: Shape, cameras: list[Array], size: tuple[int, int] = (48, 36)
     start = torch.arange(len(cameras) + 1) * size[0] * size[1]
     sizes = torch.tensor([size] * len(cameras), dtype=torch.int32)
     rgb = grey.round().byte()[:, None].repeat(1, 3)
-    return Reduced(grey, rgb, start, sizes, torch.tensor(numbers, dtype=torch.float64)), [depth for _, depth in seen]
+    return SmallPictures(grey, rgb, start, sizes, torch.tensor(numbers, dtype=torch.float64)), [depth for _, depth in seen]
 
 
 def neighbours(count: int, near: float, far: float, k: int = 3) -> Pairs:
@@ -106,7 +106,9 @@ def neighbours(count: int, near: float, far: float, k: int = 3) -> Pairs:
     return Pairs(torch.tensor(compared, dtype=torch.int32), torch.tensor([[1 / far, 1 / near]] * count, dtype=torch.float64))
 
 
-def make_planes(folder: Path, shape: Shape, views: int = 9, size: tuple[int, int] = (64, 48), points: int = 300, apart: float = 0.5) -> Path:
+def make_planes(
+    folder: Path, shape: Shape, views: int = 9, size: tuple[int, int] = (64, 48), points: int = 300, apart: float = 0.5
+) -> Path:
     """Write a COLMAP capture of a shape, with points on its surfaces."""
     rng, cameras = np.random.default_rng(0), poses(views, apart)
     (folder / "images").mkdir(parents=True)

@@ -21,10 +21,10 @@ from scipy.spatial import cKDTree
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Points
-from scene_experts.data.dense.cells import Cloud, fuse, thin
-from scene_experts.data.dense.holes import fill_holes
-from scene_experts.data.dense.pairs import choose_pairs
-from scene_experts.data.dense.pictures import Reduced, reduce_pictures
+from scene_experts.data.dense.cells import SizedPoints, fuse, thin
+from scene_experts.data.dense.holes import add_points, fill_holes
+from scene_experts.data.dense.pairs import MARGINS, choose_pairs
+from scene_experts.data.dense.pictures import SmallPictures, reduce_pictures
 from scene_experts.data.dense.sweep import DepthMaps
 from scene_experts.data.views import Capture
 
@@ -81,15 +81,15 @@ def start_densely(capture: Capture, most: int = 0) -> DenseStart:
         raise InputError("expected 3D points in the capture for --init dense, which tell how far things are, found none; use --init random")
     if len(capture.train) < FEWEST:
         raise InputError(f"expected at least {FEWEST} training views for --init dense, found {len(capture.train)}; {_OTHERWISE}")
-    own = Cloud.of(capture.points.xyz.double().numpy(), capture.points.rgb.numpy())
+    own = SizedPoints.of(capture.points.xyz.double().numpy(), capture.points.rgb.numpy())
     maps = sweep_views(capture, own)
-    holes, share = hole_points(maps)
-    wanted = choose_number(capture, len(own), most)
+    own = clear_points(maps, own, IN_FRONT)
+    holes, share = hole_points(maps, own)
+    wanted = choose_number(capture, len(capture.points.xyz), most)
     part = max(1, int(PART * wanted))
     if len(holes) > part:
         holes, _ = thin(holes, part)
     surface = surface_points(maps)
-    own = clear_points(maps, own, IN_FRONT)
     first, edge = thin(surface, wanted - len(holes), least=2)
     own = own.pick(find_uncovered(own, first, edge)).spread(part)
     thinned, _ = thin(surface, wanted - len(holes) - len(own), least=2)
@@ -99,7 +99,7 @@ def start_densely(capture: Capture, most: int = 0) -> DenseStart:
     return DenseStart(points, maps.pairs.swept, share, len(own), time.process_time() - began)
 
 
-def sweep_views(capture: Capture, own: Cloud) -> DepthMaps:
+def sweep_views(capture: Capture, own: SizedPoints) -> DepthMaps:
     """Return the confirmed depths of the training views. Raises InputError as `start_densely`."""
     pictures = reduce_pictures(capture, SIDE)
     pairs = choose_pairs(pictures, own.xyz, COMPARED)
@@ -126,14 +126,14 @@ def choose_number(capture: Capture, own: int, most: int) -> int:
     return max(1, min(wanted, int(OF_CAP * most)) if most else wanted)
 
 
-def clear_points(maps: DepthMaps, cloud: Cloud, front: float, seen: int = 0) -> Cloud:
+def clear_points(maps: DepthMaps, cloud: SizedPoints, front: float, seen: int = 0) -> SizedPoints:
     """Return the points that `seen` views see or more, and through which hardly any view sees: one
     through which many see would be fog."""
     before, on = maps.compare(cloud.xyz, front)
     return cloud.pick((before <= THROUGH * on) & (on >= seen))
 
 
-def find_uncovered(own: Cloud, surface: Cloud, edge: float) -> np.ndarray:
+def find_uncovered(own: SizedPoints, surface: SizedPoints, edge: float) -> np.ndarray:
     """Return which points [n] have no point of the surface in reach of one cell. edge: of the
     cells, in footprints."""
     if len(own) == 0 or len(surface) == 0:
@@ -142,16 +142,16 @@ def find_uncovered(own: Cloud, surface: Cloud, edge: float) -> np.ndarray:
     return distance > edge * surface.size[nearest]
 
 
-def surface_points(maps: DepthMaps) -> Cloud:
+def surface_points(maps: DepthMaps) -> SizedPoints:
     """Return a point for each pixel with a depth that enough views see and that hardly any view
     sees through."""
-    cloud = Cloud.join([_cloud_of(maps.pictures, view, *_known(maps, view)) for view in range(len(maps.pictures))])
+    cloud = SizedPoints.join([_cloud_of(maps.pictures, view, *_known(maps, view)) for view in range(len(maps.pictures))])
     return clear_points(maps, cloud, IN_FRONT, SEEN)
 
 
-def hole_points(maps: DepthMaps) -> tuple[Cloud, float]:
-    """Return points for the parts of the pictures without depth, one in a cell of their spacing,
-    and the share of these parts."""
+def hole_points(maps: DepthMaps, own: SizedPoints) -> tuple[SizedPoints, float]:
+    """Return points for the parts of the pictures without depth and without a point of the
+    capture's `own`, one in a cell of their spacing, and the share of these parts."""
     parts, cells = [], 0
     for view in range(len(maps.pictures)):
         width, height = maps.pictures.size[view].tolist()
@@ -160,12 +160,14 @@ def hole_points(maps: DepthMaps) -> tuple[Cloud, float]:
         if near == 0:
             continue
         counts = maps.pictures.grey[first:last].numpy() >= 0
-        found = fill_holes(maps.inverse[first:last].double().numpy().reshape(height, width), far)
+        pixels, depth = maps.pictures.find_pixels(view, own.xyz)
+        known = add_points(maps.inverse[first:last].double().numpy().reshape(height, width), pixels, 1 / depth)
+        found = fill_holes(known, far * MARGINS[1])  # at the depth of the farthest points
         inside = counts[found.pixels]
         part = _cloud_of(maps.pictures, view, found.pixels[inside], found.inverse[inside], np.ones(int(inside.sum())))
         parts.append(replace(part, size=part.size * found.edge))
         cells += found.cells
-    cloud = Cloud.join(parts)
+    cloud = SizedPoints.join(parts)
     share = len(cloud) / max(cells, 1)
     return fuse(clear_points(maps, cloud, FILL_IN_FRONT), 1.0), share
 
@@ -177,7 +179,7 @@ def _known(maps: DepthMaps, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return pixels, inverse[pixels], score[pixels]
 
 
-def _cloud_of(pictures: Reduced, view: int, pixels: np.ndarray, inverse: np.ndarray, weight: np.ndarray) -> Cloud:
+def _cloud_of(pictures: SmallPictures, view: int, pixels: np.ndarray, inverse: np.ndarray, weight: np.ndarray) -> SizedPoints:
     depth = 1 / inverse
     rgb = pictures.rgb[int(pictures.start[view]) + torch.from_numpy(pixels)].double().numpy()
-    return Cloud(pictures.unproject(view, pixels, depth), rgb, depth / float(pictures.cameras[view, 12]), weight)
+    return SizedPoints(pictures.unproject(view, pixels, depth), rgb, depth / float(pictures.cameras[view, 12]), weight)

@@ -13,7 +13,7 @@ _BITS = 20  # of a cell's number along each axis
 
 
 @dataclass(frozen=True)
-class Cloud:
+class SizedPoints:
     """n points with the pictures' colours."""
 
     xyz: NDArray[np.float64]  # [n, 3] world
@@ -24,28 +24,28 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.xyz)
 
-    def pick(self, chosen: NDArray[np.bool_]) -> Cloud:
+    def pick(self, chosen: NDArray[np.bool_]) -> SizedPoints:
         """Return the chosen [n] points."""
-        return Cloud(self.xyz[chosen], self.rgb[chosen], self.size[chosen], self.weight[chosen])
+        return SizedPoints(self.xyz[chosen], self.rgb[chosen], self.size[chosen], self.weight[chosen])
 
-    def spread(self, most: int) -> Cloud:
+    def spread(self, most: int) -> SizedPoints:
         """Return at most `most` of the points, evenly spread over their order."""
         chosen = np.zeros(len(self), dtype=np.bool_)
         chosen[np.linspace(0, len(self) - 1, min(most, len(self))).round().astype(np.int64)] = True
         return self.pick(chosen)
 
     @classmethod
-    def of(cls, xyz: NDArray[np.float64], rgb: NDArray[np.uint8]) -> Cloud:
+    def of(cls, xyz: NDArray[np.float64], rgb: NDArray[np.uint8]) -> SizedPoints:
         """Return points [n, 3] without a size, of equal weight."""
         return cls(xyz, rgb.astype(np.float64), np.zeros(len(xyz)), np.ones(len(xyz)))
 
     @classmethod
-    def join(cls, parts: list[Cloud]) -> Cloud:
+    def join(cls, parts: list[SizedPoints]) -> SizedPoints:
         """Return the points of all parts, of which there is at least one."""
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("xyz", "rgb", "size", "weight")))
 
 
-def fuse(cloud: Cloud, edge: float, least: int = 1) -> Cloud:
+def fuse(cloud: SizedPoints, edge: float, least: int = 1) -> SizedPoints:
     """Return the weighted mean of the points of each cell that holds at least `least`.
 
     The edge of a point's cell is the largest power of two, in world units, that is at most `edge`
@@ -60,10 +60,10 @@ def fuse(cloud: Cloud, edge: float, least: int = 1) -> Cloud:
     total = np.bincount(place, cloud.weight)
     mean = lambda value: np.bincount(place, cloud.weight * value) / total  # noqa: E731
     means = lambda values: np.stack([mean(values[:, i]) for i in range(values.shape[1])], 1)  # noqa: E731
-    return Cloud(means(cloud.xyz), means(cloud.rgb), mean(cloud.size), total).pick(count >= least)
+    return SizedPoints(means(cloud.xyz), means(cloud.rgb), mean(cloud.size), total).pick(count >= least)
 
 
-def thin(cloud: Cloud, wanted: int, least: int = 1) -> tuple[Cloud, float]:
+def thin(cloud: SizedPoints, wanted: int, least: int = 1) -> tuple[SizedPoints, float]:
     """Return at most `wanted` points of `fuse`, as many as possible, and the edge of their cells."""
     low, high = np.log2(FINEST), np.log2(COARSEST)
     found = fuse(cloud, COARSEST, least)

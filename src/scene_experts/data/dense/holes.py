@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 SPACING = 1 / 25  # edge of the cells that get a point, of the longer side
 REACH = 4  # edge of the surrounding that is looked at, in cells
@@ -29,24 +30,45 @@ class Holes:
 def fill_holes(inverse: Floats, far: float) -> Holes:
     """Find the cells without depth, and a depth for each.
 
-    Where the surrounding has depths, the inverse depth is interpolated between them. Elsewhere it
-    is at most `far`: points must not stand in the space before a far background.
+    Where the surrounding has depths, it is the nearest pixel's: a mean of near and far would lie in
+    free space. Elsewhere it is at most `far`: points must not stand before a far background.
 
     Args:
         inverse: [H, W], inverse depths; 0: unknown.
-        far: Inverse depth of the farthest plane.
+        far: Inverse depth of what is far away.
     """
     height, width = inverse.shape
     edge = max(2, round(max(height, width) * SPACING))
     known = (inverse > 0).astype(np.float64)
-    full = interpolate(inverse, known)
+    full = take_nearest(inverse)
     around = box_mean(known, REACH * edge)
-    full = np.where(around >= COVERED, full, np.minimum(full, far))
+    full = np.where(around >= COVERED, full, np.where(full > 0, np.minimum(full, far), far))
     rows, columns = np.meshgrid(np.arange(edge // 2, height, edge), np.arange(edge // 2, width, edge), indexing="ij")
     rows, columns = rows.ravel(), columns.ravel()
     hole = box_mean(known, edge)[rows, columns] < EMPTY
     rows, columns = rows[hole], columns[hole]
     return Holes(rows * width + columns, full[rows, columns], edge, len(hole))
+
+
+def add_points(inverse: Floats, pixels: NDArray[np.int64], values: Floats) -> Floats:
+    """Return the inverse depths [H, W] with those of points: `values` [n] at `pixels` [n]. A point
+    counts for its pixel and the eight around it, where nothing is known; the nearest wins."""
+    height, width = inverse.shape
+    seen = np.zeros((height + 2, width + 2))
+    rows, columns = pixels // width, pixels % width
+    for down in range(3):
+        for right in range(3):
+            np.maximum.at(seen, (rows + down, columns + right), values)
+    return np.where(inverse > 0, inverse, seen[1:-1, 1:-1])
+
+
+def take_nearest(inverse: Floats) -> Floats:
+    """Return `inverse` [H, W] with that of the nearest known pixel where it is 0; 0 if none is
+    known."""
+    if not inverse.any():
+        return inverse
+    rows, columns = distance_transform_edt(inverse == 0, return_distances=False, return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
+    return inverse[rows, columns]
 
 
 def box_mean(values: Floats, edge: int) -> Floats:
@@ -60,23 +82,3 @@ def box_mean(values: Floats, edge: int) -> Floats:
         shape = (-1, 1) if axis == 0 else (1, -1)
         values = (sums.take(high, axis) - sums.take(low, axis)) / (high - low).reshape(shape)
     return values
-
-
-def interpolate(values: Floats, weight: Floats) -> Floats:
-    """Return `values` [H, W] where `weight` is 1, and elsewhere those of the next coarser picture in
-    a pyramid of halves that has any (push-pull, Gortler et al. 1996); 0 where there are none."""
-    if min(values.shape) == 1 or weight.all():
-        total = weight.sum()
-        return np.where(weight > 0, values, (values * weight).sum() / total if total > 0 else 0.0)
-    coarse, held = halve(values * weight), halve(weight)
-    mean = np.divide(coarse, held, out=np.zeros_like(coarse), where=held > 0)
-    below = interpolate(mean, (held > 0).astype(np.float64))
-    wide = np.repeat(np.repeat(below, 2, 0), 2, 1)[: values.shape[0], : values.shape[1]]
-    return np.where(weight > 0, values, wide)
-
-
-def halve(values: Floats) -> Floats:
-    """Return the sums of the squares of 2 x 2 pixels; the border is padded with zeros."""
-    height, width = values.shape
-    padded = np.pad(values, ((0, height % 2), (0, width % 2)))
-    return padded[0::2, 0::2] + padded[1::2, 0::2] + padded[0::2, 1::2] + padded[1::2, 1::2]

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from scene_experts.data.dense.pictures import Reduced
+from scene_experts.data.dense.pictures import SmallPictures
 
 BEST_ANGLE = 10.0  # degrees between the rays of two views to a point: less is inexact, more looks different
 NARROWER, WIDER = 5.0, 10.0  # standard deviations of the weight of smaller and of larger angles, degrees
@@ -45,7 +45,7 @@ class Pairs:
         return torch.from_numpy(first), torch.tensor([other for s in known for other in sorted(s)], dtype=torch.int32)
 
 
-def choose_pairs(pictures: Reduced, xyz: NDArray[np.float64], k: int) -> Pairs:
+def choose_pairs(pictures: SmallPictures, xyz: NDArray[np.float64], k: int) -> Pairs:
     """Choose up to `k` views for each view to be compared with, and its range of depths.
 
     The merit of a pair is the share of the view's points [P, 3] that both show, times a Gaussian of

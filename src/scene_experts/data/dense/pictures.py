@@ -20,7 +20,7 @@ _GREY = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # luma of ITU-R BT.60
 
 
 @dataclass(frozen=True)
-class Reduced:
+class SmallPictures:
     """V pictures with P pixels in all, one after another, row by row."""
 
     grey: Tensor  # [P] float32, 0 to 255; UNCOUNTED where a pixel does not count
@@ -54,6 +54,13 @@ class Reduced:
         u, v = c[12] * local[:, 0] / z + c[14], c[13] * local[:, 1] / z + c[15]
         return local, (local[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
 
+    def find_pixels(self, view: int, xyz: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the pixels [m] of a view that show m of the points [n, 3], and their depths [m]."""
+        local, inside = self.project(view, xyz)
+        c, local = self.cameras[view].numpy(), local[inside]
+        u, v = c[12] * local[:, 0] / local[:, 2] + c[14], c[13] * local[:, 1] / local[:, 2] + c[15]
+        return v.astype(np.int64) * int(self.size[view, 0]) + u.astype(np.int64), local[:, 2]
+
     def unproject(self, view: int, pixels: NDArray[np.int64], depth: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the world points [n, 3] that the centres of a view's `pixels` [n] show at `depth`
         [n]. Pixels are counted from the view's first."""
@@ -68,7 +75,7 @@ def _rotate(xyz: NDArray[np.float64], R: NDArray[np.float64]) -> NDArray[np.floa
     return xyz[:, :1] * R[:, 0] + xyz[:, 1:2] * R[:, 1] + xyz[:, 2:] * R[:, 2]
 
 
-def reduce_pictures(capture: Capture, side: int) -> Reduced:
+def reduce_pictures(capture: Capture, side: int) -> SmallPictures:
     """Reduce the training photographs, undistorted as they are trained on, until their longer side
     is `side` px; smaller ones stay as they are. Held-out photographs are not read.
 
@@ -90,7 +97,7 @@ def reduce_pictures(capture: Capture, side: int) -> Reduced:
         cameras.append(_numbers(camera, size))
         sizes.append(size)
     start = np.concatenate(([0], np.cumsum([len(part) for part in grey])))
-    return Reduced(
+    return SmallPictures(
         torch.from_numpy(np.concatenate(grey)),
         torch.from_numpy(np.concatenate(rgb)),
         torch.from_numpy(start),

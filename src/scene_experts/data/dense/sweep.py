@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from scene_experts.data.dense.pairs import Pairs
-from scene_experts.data.dense.pictures import Reduced
+from scene_experts.data.dense.pictures import SmallPictures
 from scene_experts.native import library as native
 from scene_experts.native.api import SeSweep
 
@@ -28,7 +28,7 @@ class DepthMaps:
     score: Tensor
     """[P] float32, ZNCC of the pixel at this depth; -1: unknown."""
 
-    def __init__(self, pictures: Reduced, pairs: Pairs, planes: int) -> None:
+    def __init__(self, pictures: SmallPictures, pairs: Pairs, planes: int) -> None:
         """Sweep all views with `planes` planes, at least 3.
 
         Raises InputError without the compiled library, RunError if memory runs out.

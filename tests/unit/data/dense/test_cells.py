@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from scene_experts.data.dense.cells import FINEST, Cloud, fuse, thin
+from scene_experts.data.dense.cells import FINEST, SizedPoints, fuse, thin
 
 
 def cloud(n=2000, seed=0, size=0.01):
     rng = np.random.default_rng(seed)
-    return Cloud(rng.uniform(-1, 1, (n, 3)) * (1, 1, 0.001), rng.uniform(0, 255, (n, 3)), np.full(n, size), rng.uniform(0.5, 1, n))
+    return SizedPoints(rng.uniform(-1, 1, (n, 3)) * (1, 1, 0.001), rng.uniform(0, 255, (n, 3)), np.full(n, size), rng.uniform(0.5, 1, n))
 
 
 def fuse_slowly(points, edge, least):
@@ -51,7 +51,7 @@ def test_farther_points_are_spaced_more_widely():
 
 def test_clouds_are_joined_picked_and_spread():
     points = cloud(10)
-    joined = Cloud.join([points, points.pick(np.arange(10) < 2)])
+    joined = SizedPoints.join([points, points.pick(np.arange(10) < 2)])
     assert len(joined) == 12 and (joined.xyz[10:] == points.xyz[:2]).all()
     assert (points.spread(3).xyz == points.xyz[[0, 4, 9]]).all() and len(points.spread(20)) == 10 and len(points.spread(0)) == 0
-    assert Cloud.of(points.xyz, np.zeros((10, 3), dtype=np.uint8)).weight.sum() == 10
+    assert SizedPoints.of(points.xyz, np.zeros((10, 3), dtype=np.uint8)).weight.sum() == 10

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from scene_experts.data.dense.holes import box_mean, fill_holes, halve, interpolate
+from scene_experts.data.dense.holes import add_points, box_mean, fill_holes, take_nearest
 
 
-def test_a_small_hole_is_interpolated_and_a_large_one_is_far():
+def test_a_small_hole_is_as_far_as_its_rim_and_a_large_one_is_far():
     inverse = np.full((80, 100), 0.25)
     inverse[10:18, 10:18] = 0  # small
     inverse[:, 50:] = 0  # large
@@ -25,7 +25,7 @@ def test_a_picture_with_depth_everywhere_has_no_holes():
 
 def test_a_picture_without_depth_is_far():
     holes = fill_holes(np.zeros((30, 40)), 0.1)
-    assert len(holes.pixels) == holes.cells and (holes.inverse == 0).all() or (holes.inverse == 0.1).all()
+    assert len(holes.pixels) == holes.cells and (holes.inverse == 0.1).all()
 
 
 def test_means_over_squares_are_cut_at_the_border():
@@ -37,14 +37,19 @@ def test_means_over_squares_are_cut_at_the_border():
             assert found[row, column] == pytest.approx(square.mean())
 
 
-def test_interpolation_keeps_what_is_known_and_stays_within_it():
+def test_an_unknown_depth_is_that_of_the_nearest_pixel():
     rng = np.random.default_rng(0)
-    values, weight = rng.uniform(1, 2, (21, 34)), (rng.random((21, 34)) < 0.1).astype(float)
-    found = interpolate(values * weight, weight)
-    assert (found[weight > 0] == values[weight > 0]).all()
-    assert found.min() >= values[weight > 0].min() - 1e-12 and found.max() <= values[weight > 0].max() + 1e-12
-    assert (interpolate(np.zeros((5, 7)), np.zeros((5, 7))) == 0).all()
+    inverse = np.where(rng.random((11, 14)) < 0.1, rng.uniform(1, 2, (11, 14)), 0)
+    found, known = take_nearest(inverse), np.argwhere(inverse > 0)
+    for row, column in np.ndindex(11, 14):
+        away = ((known - (row, column)) ** 2).sum(1)
+        assert found[row, column] in inverse[tuple(known[away == away.min()].T)]
+    assert not take_nearest(np.zeros((5, 7))).any()
 
 
-def test_halves_are_sums_of_four():
-    assert halve(np.arange(6.0).reshape(2, 3)).tolist() == [[0 + 1 + 3 + 4, 2 + 5]]
+def test_points_fill_their_neighbourhood_and_the_nearest_wins():
+    inverse = np.zeros((6, 8))
+    inverse[2, 3] = 0.5
+    found = add_points(inverse, np.array([2 * 8 + 2, 3 * 8 + 3, 0]), np.array([0.1, 0.2, 0.3]))
+    assert found[2, 3] == 0.5 and found[1, 1] == 0.3 and found[3, 3] == 0.2 and found[2, 2] == 0.2 and found[3, 1] == 0.1
+    assert (found > 0).sum() == 17 and found[0, 0] == 0.3

@@ -1,4 +1,4 @@
-"""Reduced pictures are means of areas, and their cameras fit them."""
+"""SmallPictures pictures are means of areas, and their cameras fit them."""
 
 from dataclasses import replace
 
@@ -83,3 +83,11 @@ def test_small_pictures_stay_as_they_are_and_narrow_ones_keep_a_side(capture):
     narrow = Shown(capture, {1: Frame(torch.zeros(20, 400, 3, dtype=torch.uint8), None)})
     narrow.views = (capture.views[0], view)
     assert reduce_pictures(narrow, 100).size.tolist() == [[320, 16]]
+
+
+def test_the_pixels_of_points_are_found(capture):
+    found = reduce_pictures(capture, 40)
+    pixels = np.arange(0, 1200, 11)
+    xyz = np.concatenate((found.unproject(1, pixels, np.full(len(pixels), 3.0)), found.unproject(1, pixels[:5], np.full(5, -3.0))))
+    again, depth = found.find_pixels(1, xyz)
+    assert (again == pixels).all() and np.allclose(depth, 3.0)
