@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Points
@@ -136,9 +135,11 @@ def clear_points(maps: DepthMaps, cloud: SizedPoints, front: float, seen: int = 
 def find_uncovered(own: SizedPoints, surface: SizedPoints, edge: float) -> np.ndarray:
     """Return which points [n] have no point of the surface in reach of one cell. edge: of the
     cells, in footprints."""
+    from scipy.spatial import KDTree  # takes long to import, and most trainings do not need it
+
     if len(own) == 0 or len(surface) == 0:
         return np.ones(len(own), dtype=np.bool_)
-    distance, nearest = cKDTree(surface.xyz).query(own.xyz)
+    distance, nearest = KDTree(surface.xyz).query(own.xyz)
     return distance > edge * surface.size[nearest]
 
 

@@ -57,7 +57,7 @@ def fuse(cloud: SizedPoints, edge: float, least: int = 1) -> SizedPoints:
     cell = np.floor(cloud.xyz / np.exp2(level)[:, None]).astype(np.int64) & ((1 << _BITS) - 1)  # far cells may meet, which is rare
     key = ((level - level.min()) & 15) << (3 * _BITS) | cell[:, 0] << (2 * _BITS) | cell[:, 1] << _BITS | cell[:, 2]
     _, place, count = np.unique(key, return_inverse=True, return_counts=True)
-    total = np.bincount(place, cloud.weight)
+    total = np.bincount(place, cloud.weight).astype(np.float64)
     mean = lambda value: np.bincount(place, cloud.weight * value) / total  # noqa: E731
     means = lambda values: np.stack([mean(values[:, i]) for i in range(values.shape[1])], 1)  # noqa: E731
     return SizedPoints(means(cloud.xyz), means(cloud.rgb), mean(cloud.size), total).pick(count >= least)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 SPACING = 1 / 25  # edge of the cells that get a point, of the longer side
 REACH = 4  # edge of the surrounding that is looked at, in cells
@@ -65,6 +64,8 @@ def add_points(inverse: Floats, pixels: NDArray[np.int64], values: Floats) -> Fl
 def take_nearest(inverse: Floats) -> Floats:
     """Return `inverse` [H, W] with that of the nearest known pixel where it is 0; 0 if none is
     known."""
+    from scipy.ndimage import distance_transform_edt  # takes long to import, and most trainings do not need it
+
     if not inverse.any():
         return inverse
     rows, columns = distance_transform_edt(inverse == 0, return_distances=False, return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
