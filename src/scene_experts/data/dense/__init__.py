@@ -28,9 +28,9 @@ from scene_experts.data.dense.sweep import DepthMaps
 from scene_experts.data.views import Capture
 
 _OTHERWISE = "leave --init dense out"
-SIDE = 160  # px, longer side of the reduced pictures
-PLANES = 48
-COMPARED = 3  # views that a view is compared with
+SIDE = 200  # px, longer side of the reduced pictures
+PLANES = 64
+COMPARED = 5  # views that a view is compared with
 FEWEST = 3  # views with a sweep
 IN_FRONT, FILL_IN_FRONT = 0.04, 0.02  # share of a depth by which a point, and one of a hole, may lie before it
 SEEN = 3  # views whose depth a point must lie on, its own among them
@@ -38,6 +38,7 @@ THROUGH = 0.1  # views that may see through a point, per view that sees it
 LEAST_DEPTH = 0.01  # share of the pictures that must have depth
 PIXELS = 8  # of a training picture per point
 PART = 1 / 3  # largest share of the points in holes, and of the capture's own
+MANY = 12  # pixels looked at per point that is wanted; of more, every nth is taken
 OF_CAP = 0.8  # share of the largest number of rows that the points may be, so that growth has room
 
 
@@ -88,7 +89,7 @@ def start_densely(capture: Capture, most: int = 0) -> DenseStart:
     part = max(1, int(PART * wanted))
     if len(holes) > part:
         holes, _ = thin(holes, part)
-    surface = surface_points(maps)
+    surface = surface_points(maps, MANY * wanted)
     first, edge = thin(surface, wanted - len(holes), least=2)
     own = own.pick(find_uncovered(own, first, edge)).spread(part)
     thinned, _ = thin(surface, wanted - len(holes) - len(own), least=2)
@@ -143,10 +144,11 @@ def find_uncovered(own: SizedPoints, surface: SizedPoints, edge: float) -> np.nd
     return distance > edge * surface.size[nearest]
 
 
-def surface_points(maps: DepthMaps) -> SizedPoints:
-    """Return a point for each pixel with a depth that enough views see and that hardly any view
-    sees through."""
-    cloud = SizedPoints.join([_cloud_of(maps.pictures, view, *_known(maps, view)) for view in range(len(maps.pictures))])
+def surface_points(maps: DepthMaps, most: int) -> SizedPoints:
+    """Return points of pixels with a depth that enough views see and that hardly any view sees
+    through: of every pixel, or of every nth so that there are about `most`."""
+    every = max(1, int((maps.inverse > 0).sum()) // max(most, 1))
+    cloud = SizedPoints.join([_cloud_of(maps.pictures, view, *_known(maps, view, every)) for view in range(len(maps.pictures))])
     return clear_points(maps, cloud, IN_FRONT, SEEN)
 
 
@@ -173,10 +175,10 @@ def hole_points(maps: DepthMaps, own: SizedPoints) -> tuple[SizedPoints, float]:
     return fuse(clear_points(maps, cloud, FILL_IN_FRONT), 1.0), share
 
 
-def _known(maps: DepthMaps, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _known(maps: DepthMaps, view: int, every: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     first, last = maps.pictures.start[view : view + 2].tolist()
     inverse, score = maps.inverse[first:last].double().numpy(), maps.score[first:last].double().numpy()
-    pixels = np.flatnonzero(inverse > 0)
+    pixels = np.flatnonzero(inverse > 0)[view % every :: every]
     return pixels, inverse[pixels], score[pixels]
 
 

@@ -15,7 +15,7 @@ from scene_experts.data.dense.pictures import SmallPictures
 from scene_experts.native import library as native
 from scene_experts.native.api import SeSweep
 
-STRONG, WEAK = 0.6, 0.4  # ZNCC that a depth needs, and that a depth needs to confirm another
+STRONG, WEAK = 0.4, 0.3  # ZNCC that a depth needs, and that a depth needs to confirm another; agreement tells more than ZNCC
 AGREEMENT = 0.015  # largest difference of two depths that confirm each other, relative
 CONFIRMED = 2  # views that must confirm a depth
 
