@@ -87,8 +87,8 @@ class Capture:
 
     @property
     def points(self) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-        """The 3D points that a training starts from: positions [P, 3] float64, and colours [P, 3]
-        uint8, RGB."""
+        """The 3D points that a training starts from, or with the start "dense" computes more from:
+        positions [P, 3] float64, and colours [P, 3] uint8, RGB."""
         points = self.loaded.points
         if points is None:
             return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)
