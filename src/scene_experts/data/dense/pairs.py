@@ -18,6 +18,7 @@ LEAST_SHARED = 10  # points that two views must share
 QUANTILES = (0.01, 0.99)  # of the depths of the points that a view shows
 MARGINS = (0.8, 1.3)  # factors of these depths: the range of the sweep
 _MOST, _WORK = 2000, 2e8  # points that decide, and pairs of views times points
+_MEASURED = 100_000  # points whose depths are looked at
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def choose_pairs(pictures: SmallPictures, xyz: NDArray[np.float64], k: int) -> P
     """
     count = len(pictures)
     most = int(np.clip(_WORK / max(count, 1) ** 2, 100, _MOST))
-    chosen = xyz[np.linspace(0, len(xyz) - 1, min(most, len(xyz))).round().astype(np.int64)]
+    chosen, xyz = _spread(xyz, most), _spread(xyz, _MEASURED)
     shown = np.stack([pictures.project(view, chosen)[1] for view in range(count)])
     rays = _unit(chosen[None] - pictures.centres[:, None])  # [V, S, 3]
     forward = pictures.rotations[0][:, 2]
@@ -88,6 +89,11 @@ def _merits(view: int, shown: NDArray[np.bool_], rays: NDArray[np.float64], forw
         width = NARROWER if angle < BEST_ANGLE else WIDER
         merit[other] = shared[other] / len(mine) * np.exp(-((angle - BEST_ANGLE) ** 2) / (2 * width**2))
     return np.where(merit > 1e-6, merit, 0.0)
+
+
+def _spread(xyz: NDArray[np.float64], most: int) -> NDArray[np.float64]:
+    """Return at most `most` of the points, evenly spread over their order."""
+    return xyz[np.linspace(0, len(xyz) - 1, min(most, len(xyz))).round().astype(np.int64)]
 
 
 def _unit(xyz: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -88,7 +88,7 @@ def reduce_pictures(capture: Capture, side: int) -> SmallPictures:
         frame, camera = capture.frame(index), capture.views[index].camera
         size = _reduced_size(camera, side)
         pixels = np.asarray(Image.fromarray(frame.rgb.numpy()).resize(size, Image.Resampling.BOX)).reshape(-1, 3)
-        level = pixels.astype(np.float32) @ _GREY
+        level = (pixels.astype(np.float32) * _GREY).sum(1)
         if frame.mask is not None:
             mask = Image.fromarray((frame.mask.numpy() * 255).round().astype(np.uint8))
             level[np.asarray(mask.resize(size, Image.Resampling.BOX)).reshape(-1) < 255] = UNCOUNTED

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.spatial import KDTree
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Points
@@ -13,6 +14,8 @@ from scene_experts.data.dense import SizedPoints, choose_number, find_uncovered,
 from scene_experts.native import library as native
 from support.captures import load
 from support.planes import hole, make_planes, plane
+from support.synthetic import make_capture
+from support.synthetic import surface_points as surface_points_of_the_scene
 
 pytestmark = pytest.mark.skipif(native.load() is None, reason="no compiled library")
 
@@ -140,4 +143,16 @@ def test_photographs_without_texture_are_refused(tmp_path):
     capture = opened(make_planes(tmp_path / "grey", hole(3.0, 50.0, 4.0)))
     with pytest.raises(InputError, match=r"expected photographs in which --init dense finds depth, found it in 0\.0 % of their pixels"):
         start_densely(capture)
+    capture.images.close()
+
+
+@pytest.mark.slow
+def test_pictures_of_several_sizes_and_lenses_are_swept(tmp_path):
+    made = make_capture(tmp_path / "capture", views=16, size=(144, 96))
+    capture = opened(made.folder)
+    found = start_densely(capture)
+    fresh = found.points.xyz[found.kept :].numpy()
+    assert len({view.camera.width for view in capture.views}) == 3 and found.views == 14 and len(fresh) > 300
+    tree = KDTree(surface_points_of_the_scene(40_000, np.random.default_rng(0)))
+    assert np.median(tree.query(fresh)[0]) < 0.15  # of a scene of four units
     capture.images.close()
