@@ -24,30 +24,39 @@ constexpr float VOID = -1000.f;  // a pixel without a value
 // A window with VOID and without it has at least 1/49 48/49 1000^2 as its variance; one of grey levels alone at most 127.5^2 = 16256.
 constexpr float BROKEN = 17000.f;
 
-// Sums over windows of a picture of W x H pixels. Pixels nearer than RADIUS to the border have no sum.
-class Windows {
- public:
-  Windows(int W, int H) : W_(W), H_(H), column_(W) {}
+template <class F>
+inline float sum_of_seven(F&& value) {
+  return ((value(0) + value(1)) + (value(2) + value(3))) + ((value(4) + value(5)) + value(6));
+}
 
-  // Call row(y, sums) for each y, with sums [W] over the windows of row y.
-  void sum(const float* picture, float* out) {
-    float* __restrict column = column_.data();
-    for (int y = RADIUS; y < H_ - RADIUS; ++y) {
-      const float* __restrict p = picture + static_cast<int64_t>(y - RADIUS) * W_;
-      const int64_t W = W_;
-      for (int64_t x = 0; x < W; ++x)
-        column[x] = ((p[x] + p[x + W]) + (p[x + 2 * W] + p[x + 3 * W])) + ((p[x + 4 * W] + p[x + 5 * W]) + p[x + 6 * W]);
-      float* __restrict o = out + static_cast<int64_t>(y) * W_;
-      for (int64_t x = RADIUS; x < W - RADIUS; ++x) {
-        const float* c = column + x - RADIUS;
-        o[x] = ((c[0] + c[1]) + (c[2] + c[3])) + ((c[4] + c[5]) + c[6]);
-      }
+// Sums over columns of seven pixels of a row of windows: of w, w^2 and w g. A row is short, so they stay in the cache.
+class Columns {
+ public:
+  explicit Columns(int W) : W_(W), sum_(W), squares_(W), cross_(W) {}
+
+  // w and g: the first of seven rows.
+  void fill(const float* __restrict w, const float* __restrict g) {
+    float *__restrict sum = sum_.data(), *__restrict squares = squares_.data(), *__restrict cross = cross_.data();
+    const int64_t W = W_;
+    for (int64_t x = 0; x < W; ++x) {
+      sum[x] = sum_of_seven([&](int64_t k) { return w[x + k * W]; });
+      squares[x] = sum_of_seven([&](int64_t k) { return w[x + k * W] * w[x + k * W]; });
+      cross[x] = sum_of_seven([&](int64_t k) { return w[x + k * W] * g[x + k * W]; });
     }
   }
 
+  // Means over the window around x.
+  float mean(int64_t x) const { return over(sum_.data(), x); }
+  float mean_square(int64_t x) const { return over(squares_.data(), x); }
+  float mean_product(int64_t x) const { return over(cross_.data(), x); }
+
  private:
-  int W_, H_;
-  std::vector<float> column_;
+  static float over(const float* __restrict row, int64_t x) {
+    return sum_of_seven([&](int64_t k) { return row[x - RADIUS + k]; }) / WINDOW;
+  }
+
+  int64_t W_;
+  std::vector<float> sum_, squares_, cross_;
 };
 
 // The homography of each plane is base + w slope.
@@ -57,7 +66,8 @@ struct Warp {
   Warp(const se::SweepCamera& from, const se::SweepCamera& to) {
     double R[9], t[3], K[9] = {to.fx, 0, to.cx, 0, to.fy, to.cy, 0, 0, 1};
     for (int i = 0; i < 3; ++i) {
-      for (int j = 0; j < 3; ++j) R[3 * i + j] = to.R[3 * i] * from.R[3 * j] + to.R[3 * i + 1] * from.R[3 * j + 1] + to.R[3 * i + 2] * from.R[3 * j + 2];
+      const double* row = to.R + 3 * i;
+      for (int j = 0; j < 3; ++j) R[3 * i + j] = row[0] * from.R[3 * j] + row[1] * from.R[3 * j + 1] + row[2] * from.R[3 * j + 2];
       t[i] = to.t[i] - (R[3 * i] * from.t[0] + R[3 * i + 1] * from.t[1] + R[3 * i + 2] * from.t[2]);
     }
     for (int i = 0; i < 3; ++i) {
@@ -101,20 +111,19 @@ void warp(const Warp& by, double w, const float* picture, int32_t width, int32_t
 class Sweep {
  public:
   Sweep(const SeSweep& call, int64_t view)
-      : call_(call), from_(call, view), view_(view), W_(from_.width), H_(from_.height), n_(static_cast<int64_t>(W_) * H_), windows_(W_, H_) {}
+      : call_(call), from_(call, view), view_(view), W_(from_.width), H_(from_.height), n_(static_cast<int64_t>(W_) * H_), columns_(W_) {}
 
   void run() {
     const float* source = call_.grey + call_.start[view_];
     std::vector<float> grey(source, source + n_);
     for (float& g : grey) g = g < 0.f ? VOID : g;
-    warped_.resize(n_), product_.resize(n_), sum_.assign(n_, 0.f), squares_.assign(n_, 0.f), cross_.assign(n_, 0.f);
-    mean_.assign(n_, 0.f), variance_.assign(n_, 2 * BROKEN);
-    windows_.sum(grey.data(), sum_.data());
-    multiply(grey.data(), grey.data());
-    windows_.sum(product_.data(), squares_.data());
-    each_row([&](int64_t i) {
-      mean_[i] = sum_[i] / WINDOW;
-      variance_[i] = std::max(squares_[i] / WINDOW - mean_[i] * mean_[i], 0.f);
+    warped_.resize(n_), mean_.assign(n_, 0.f), variance_.assign(n_, 2 * BROKEN);
+    each_row([&](int64_t row) {
+      columns_.fill(grey.data() + row, grey.data() + row);
+      for (int64_t x = RADIUS; x < W_ - RADIUS; ++x) {
+        const float m = columns_.mean(x);
+        mean_[at(row, x)] = m, variance_[at(row, x)] = std::max(columns_.mean_square(x) - m * m, 0.f);
+      }
     });
     first_.resize(n_), second_.resize(n_);
     best_.assign(n_, -2.f), left_.assign(n_, -1.f), right_.assign(n_, -1.f), previous_.assign(n_, -1.f), plane_.assign(n_, -1);
@@ -122,49 +131,44 @@ class Sweep {
     for (int64_t j = 0; j < call_.k; ++j)
       if (const int64_t other = call_.compared[view_ * call_.k + j]; other >= 0)
         others.emplace_back(other, Warp(from_, se::SweepCamera(call_, other)));
-    const double near_end = call_.planes[2 * view_], step = (call_.planes[2 * view_ + 1] - near_end) / static_cast<double>(call_.count - 1);
+    const double begin = call_.planes[2 * view_], step = (call_.planes[2 * view_ + 1] - begin) / static_cast<double>(call_.count - 1);
     for (int64_t d = 0; d < call_.count; ++d) {
       std::fill(first_.begin(), first_.end(), -1.f), std::fill(second_.begin(), second_.end(), -1.f);
       for (const auto& [other, by] : others) {
         const int32_t width = call_.size[2 * other], height = call_.size[2 * other + 1];
-        warp(by, near_end + static_cast<double>(d) * step, call_.grey + call_.start[other], width, height, W_, H_, warped_.data());
+        warp(by, begin + static_cast<double>(d) * step, call_.grey + call_.start[other], width, height, W_, H_, warped_.data());
         compare(grey.data());
       }
       choose(static_cast<int32_t>(d));
     }
-    finish(near_end, step);
+    finish(begin, step);
   }
 
  private:
+  // Call f(row) for each row of windows; row: the number of the first pixel of its first row.
   template <class F>
   void each_row(F&& f) {
-    for (int y = RADIUS; y < H_ - RADIUS; ++y)
-      for (int64_t i = static_cast<int64_t>(y) * W_ + RADIUS; i < static_cast<int64_t>(y + 1) * W_ - RADIUS; ++i) f(i);
+    for (int64_t y = 0; y < H_ - 2 * RADIUS; ++y) f(y * W_);
   }
 
-  void multiply(const float* __restrict a, const float* __restrict b) {
-    float* __restrict out = product_.data();
-    for (int64_t i = 0; i < n_; ++i) out[i] = a[i] * b[i];
-  }
+  // The number of the pixel in the middle of a window.
+  int64_t at(int64_t row, int64_t x) const { return row + RADIUS * W_ + x; }
 
   // Put the ZNCC of the view and the warped picture among the two best of this plane.
   void compare(const float* grey) {
-    windows_.sum(warped_.data(), sum_.data());
-    multiply(warped_.data(), warped_.data());
-    windows_.sum(product_.data(), squares_.data());
-    multiply(warped_.data(), grey);
-    windows_.sum(product_.data(), cross_.data());
-    const float *__restrict mean = mean_.data(), *__restrict variance = variance_.data();
-    const float *__restrict sum = sum_.data(), *__restrict squares = squares_.data(), *__restrict cross = cross_.data();
-    float *__restrict first = first_.data(), *__restrict second = second_.data();
-    for (int64_t i = 0; i < n_; ++i) {
-      const float m = sum[i] / WINDOW, v = squares[i] / WINDOW - m * m, c = cross[i] / WINDOW - mean[i] * m;
-      const float alike = c / std::sqrt((variance[i] + EPS) * ((v > 0.f ? v : 0.f) + EPS));
-      const float s = (v > BROKEN) | (m < 0.f) ? -1.f : alike;
-      const float low = s < first[i] ? s : first[i];
-      first[i] = s > first[i] ? s : first[i];
-      second[i] = low > second[i] ? low : second[i];
-    }
+    each_row([&](int64_t row) {
+      columns_.fill(warped_.data() + row, grey + row);
+      const float *__restrict mean = mean_.data() + at(row, 0), *__restrict variance = variance_.data() + at(row, 0);
+      float *__restrict first = first_.data() + at(row, 0), *__restrict second = second_.data() + at(row, 0);
+      for (int64_t x = RADIUS; x < W_ - RADIUS; ++x) {
+        const float m = columns_.mean(x), v = columns_.mean_square(x) - m * m, c = columns_.mean_product(x) - mean[x] * m;
+        const float alike = c / std::sqrt((variance[x] + EPS) * ((v > 0.f ? v : 0.f) + EPS));
+        const float s = (v > BROKEN) | (m < 0.f) ? -1.f : alike;
+        const float low = s < first[x] ? s : first[x];
+        first[x] = s > first[x] ? s : first[x];
+        second[x] = low > second[x] ? low : second[x];
+      }
+    });
   }
 
   // Keep the best plane so far and the scores beside it.
@@ -184,15 +188,18 @@ class Sweep {
     }
   }
 
-  void finish(double near_end, double step) {
+  void finish(double begin, double step) {
     float *inverse = call_.inverse + call_.start[view_], *score = call_.score + call_.start[view_];
     std::fill(inverse, inverse + n_, 0.f), std::fill(score, score + n_, -1.f);
-    each_row([&](int64_t i) {
-      if (plane_[i] < 1 || plane_[i] > call_.count - 2 || variance_[i] < TEXTURE || variance_[i] > BROKEN || mean_[i] < 0.f) return;
-      const float bend = left_[i] - 2.f * best_[i] + right_[i];
-      const float offset = bend < -1e-6f ? std::clamp(0.5f * (left_[i] - right_[i]) / bend, -0.5f, 0.5f) : 0.f;
-      inverse[i] = static_cast<float>(near_end + (plane_[i] + static_cast<double>(offset)) * step);
-      score[i] = best_[i];
+    each_row([&](int64_t row) {
+      for (int64_t x = RADIUS; x < W_ - RADIUS; ++x) {
+        const int64_t i = at(row, x);
+        if (plane_[i] < 1 || plane_[i] > call_.count - 2 || variance_[i] < TEXTURE || variance_[i] > BROKEN || mean_[i] < 0.f) continue;
+        const float bend = left_[i] - 2.f * best_[i] + right_[i];
+        const float offset = bend < -1e-6f ? std::clamp(0.5f * (left_[i] - right_[i]) / bend, -0.5f, 0.5f) : 0.f;
+        inverse[i] = static_cast<float>(begin + (plane_[i] + static_cast<double>(offset)) * step);
+        score[i] = best_[i];
+      }
     });
   }
 
@@ -201,8 +208,8 @@ class Sweep {
   int64_t view_;
   int W_, H_;
   int64_t n_;
-  Windows windows_;
-  std::vector<float> warped_, product_, sum_, squares_, cross_, mean_, variance_, first_, second_, best_, left_, right_, previous_;
+  Columns columns_;
+  std::vector<float> warped_, mean_, variance_, first_, second_, best_, left_, right_, previous_;
   std::vector<int32_t> plane_;
 };
 
