@@ -4,6 +4,7 @@ points alone."""
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ LEAST_SHARED = 10  # points that two views must share
 QUANTILES = (0.01, 0.99)  # of the depths of the points that a view shows
 MARGINS = (0.8, 1.3)  # factors of these depths: the range of the sweep
 _MOST, _WORK = 2000, 2e8  # points that decide, and pairs of views times points
+_FEW, _MEASURED_VIEWS = 16, 32  # points that make a view likely, and views whose angle is measured
 _MEASURED = 100_000  # points whose depths are looked at
 
 
@@ -74,26 +76,34 @@ def choose_pairs(pictures: SmallPictures, xyz: NDArray[np.float64], k: int) -> P
 
 
 def _merits(view: int, shown: NDArray[np.bool_], rays: NDArray[np.float64], forward: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the merit of each view for `view`, [V]; 0: unfit."""
+    """Return the merit of each view for `view`, [V]; 0: unfit. Only those that a few points make
+    likely are measured."""
     mine = np.flatnonzero(shown[view])
     merit = np.zeros(len(shown))
     both = shown[:, mine]
     shared = both.sum(1)
     ahead = (forward * forward[view]).sum(1) > 0
-    for other in np.flatnonzero((shared >= LEAST_SHARED) & ahead):
-        if other == view:
-            continue
-        at = mine[both[other]]
-        cosines = np.median((rays[view, at] * rays[other, at]).sum(1))
-        angle = float(np.degrees(np.arccos(np.clip(cosines, -1, 1))))
-        width = NARROWER if angle < BEST_ANGLE else WIDER
-        merit[other] = shared[other] / len(mine) * np.exp(-((angle - BEST_ANGLE) ** 2) / (2 * width**2))
+    fit = (shared >= LEAST_SHARED) & ahead
+    fit[view] = False
+    few = _spread(mine, _FEW)
+    likely = np.where(fit, shared * _weights(np.median((rays[:, few] * rays[view, few]).sum(2), 1)), -1) if len(few) else merit - 1
+    for other in np.argsort(-likely, kind="stable")[:_MEASURED_VIEWS]:
+        if fit[other]:
+            at = mine[both[other]]
+            merit[other] = shared[other] / len(mine) * _weights(np.median((rays[view, at] * rays[other, at]).sum(1)))
     return np.where(merit > 1e-6, merit, 0.0)
 
 
-def _spread(xyz: NDArray[np.float64], most: int) -> NDArray[np.float64]:
-    """Return at most `most` of the points, evenly spread over their order."""
-    return xyz[np.linspace(0, len(xyz) - 1, min(most, len(xyz))).round().astype(np.int64)]
+def _weights(cosines: NDArray[np.float64] | np.float64) -> NDArray[np.float64]:
+    """Return the weights of angles."""
+    angle = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    width = np.where(angle < BEST_ANGLE, NARROWER, WIDER)
+    return np.exp(-((angle - BEST_ANGLE) ** 2) / (2 * width**2))
+
+
+def _spread(values: NDArray[Any], most: int) -> NDArray[Any]:
+    """Return at most `most` of the values, evenly spread over their order."""
+    return values[np.linspace(0, len(values) - 1, min(most, len(values))).round().astype(np.int64)]
 
 
 def _unit(xyz: NDArray[np.float64]) -> NDArray[np.float64]:

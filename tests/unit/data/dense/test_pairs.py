@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from scene_experts.data.dense import pairs as pairs_module
 from scene_experts.data.dense.pairs import Pairs, choose_pairs
 from support.planes import plane, pose, reduced
 
@@ -54,3 +55,10 @@ def test_many_points_and_few_points_choose_alike():
     pictures = views(at_angle(0), at_angle(2), at_angle(9), at_angle(15))
     many = np.repeat(POINTS, 40, 0)
     assert torch.equal(choose_pairs(pictures, POINTS, 2).compared, choose_pairs(pictures, many, 2).compared)
+
+
+def test_of_many_views_the_likely_ones_are_measured_and_the_choice_is_the_same(monkeypatch):
+    pictures = views(*(at_angle(degrees) for degrees in np.linspace(-30, 30, 45)))
+    chosen = choose_pairs(pictures, POINTS, 5).compared
+    monkeypatch.setattr(pairs_module, "_MEASURED_VIEWS", 1000)
+    assert torch.equal(choose_pairs(pictures, POINTS, 5).compared, chosen)
