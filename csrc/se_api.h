@@ -189,4 +189,29 @@ SE_EXPORT void se_observe_drawn(const int32_t* radii, const float* gradient, con
 SE_EXPORT void se_mcmc_add_noise(float* means, const float* quats, const float* log_scales, const float* raw_opacity, const float* eta,
                                  int64_t count, float size, float sharpness, float faint, int32_t threads);
 
+// ---- Depth of photographs -------------------------------------------------------------------------------------------------------
+
+typedef struct {
+  const float* grey;        // [P], the pixels of all views: grey levels from 0 to 255; below 0 where a pixel does not count
+  const int64_t* start;     // [views + 1], the first pixel of each view
+  const int32_t* size;      // [views, 2], width and height, pixels
+  const double* camera;     // [views, 16]: the rows of [R | t], world to camera; fx, fy, cx, cy, pixels
+  const int32_t* compared;  // [views, k], the views that a view is compared with; -1: none
+  const double* planes;     // [views, 2], inverse depth of the first and the last plane; a view whose second is 0 is left out
+  float *inverse, *score;   // [P], inverse depth (0: unknown), and ZNCC (-1: unknown)
+  int64_t views, k, count;  // count: planes of a view, at least 3
+  int32_t threads;
+} SeSweep;
+
+// Fill inverse and score of each view by a plane sweep.
+SE_EXPORT int32_t se_sweep_match(const SeSweep* call);
+// agree [P]: in how many of the views others[first[v]] to others[first[v + 1] - 1] the depth of a pixel of view v is found again, within
+// the share `tolerance`, at a score above `weak`; 0 where the pixel's own score is not above `strong`.
+SE_EXPORT int32_t se_sweep_agree(const SeSweep* call, const int64_t* first, const int32_t* others, float strong, float weak,
+                                 double tolerance, int32_t* agree);
+// For points [count, 3]: the number of views in which a point lies in front of the view's depth by more than the share `front`, and in
+// which it lies within the share `near_by` of it. Pixels whose inverse depth is 0 say nothing.
+SE_EXPORT int32_t se_sweep_compare(const SeSweep* call, const double* points, int64_t count, double front, double near_by,
+                                   int32_t* before, int32_t* on);
+
 #endif

@@ -44,11 +44,12 @@ def start_changed(cfg, capture, device="cpu", dtype=torch.float32, change=CHANGE
 def events(cfg, folder, out=None, rasterizer="auto", world=None, **run):
     """Train on the capture in `folder` (or on the loaded capture `world`) and yield the events.
 
-    ordered: sum in the order of the views, as `--deterministic` does.
+    ordered: sum in the order of the views, as `--deterministic` does. init: as `--init`.
     """
-    capture = world or load(folder)
+    data = Data(folder, init=run.pop("init", "points"))
+    capture = world or load(folder, init=data.init)
     options = {"preview_every": 0, **{name: run.pop(name) for name in vars(TrainOptions()) if name in run and name != "device"}}
-    config = RunConfig.of(cfg, Data(folder), TrainOptions(deterministic=run.pop("ordered", False), **options), "", {})
+    config = RunConfig.of(cfg, data, TrainOptions(deterministic=run.pop("ordered", False), **options), "", {})
     made = Job(config, out, options=TrainOptions(**options), **run)
     try:
         yield from train(cfg, made, capture, choose(rasterizer, "cpu", deterministic=True))

@@ -214,6 +214,7 @@ FLAGS = {
     "stop before the start": ["--stop-at", "0"],
     "more chosen than there are": ["--scene.decoder.top-k", "9"],
     "unknown attribute": ["--scene.add-dist", "depth"],
+    "start unknown": ["--init", "sparse"],
     "resume without a run": ["--resume"],
     "resume and overwrite": ["--resume", "--overwrite"],
 }
@@ -224,6 +225,22 @@ def test_flags(case, made, tmp_path, capsys):
     code, sentence = said(capsys, "train", "moe-gs", "--data", made, "--out", tmp_path / "out", *iterations(FLAGS[case]), *FLAGS[case])
     assert code == 2 and not (tmp_path / "out").exists()
     as_recorded(case, sentence, tmp_path, made)
+
+
+STARTS = {
+    "dense start of two photographs": (lambda capture: None, ["--max-views", "2"]),
+    "dense start without points": (gone("sparse/0/points3D.bin"), []),
+    "dense start of points behind the cameras": (model(lambda m: replace(m, xyz=m.xyz * 0 + (0.0, 0.0, 40.0))), []),
+}
+
+
+@pytest.mark.parametrize("case", list(STARTS))
+def test_dense_starts(case, capture, tmp_path, capsys):
+    change, more = STARTS[case]
+    change(capture)
+    code, sentence = said(capsys, "train", "moe-gs", "--data", capture, "--out", tmp_path / "out", *ITERATIONS, "--init", "dense", *more)
+    assert code == 2 and not list((tmp_path / "out").glob("checkpoints/*"))
+    as_recorded(case, sentence, tmp_path)
 
 
 @pytest.mark.parametrize("more", [[], ["--overwrite"], ["--resume"]])

@@ -87,8 +87,8 @@ class Capture:
 
     @property
     def points(self) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-        """The 3D points that a training starts from: positions [P, 3] float64, and colours [P, 3]
-        uint8, RGB."""
+        """The 3D points that a training starts from, or with the start "dense" computes more from:
+        positions [P, 3] float64, and colours [P, 3] uint8, RGB."""
         points = self.loaded.points
         if points is None:
             return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)
@@ -217,7 +217,7 @@ def load_capture(
     leave_out: Sequence[str] = (),
     missing: Literal["error", "drop"] = "error",
     normalise: Literal["extent", "none"] | None = None,
-    init: Literal["points", "random"] = "points",
+    init: Literal["points", "dense", "random"] = "points",
     points: str | Path | None = None,
     model: str | None = None,
     max_views: int | None = None,
@@ -244,7 +244,8 @@ def load_capture(
         normalise: "extent" trains in a world that is scaled to a camera extent of 5, "none" in the
             capture's own unit. Default: "none" for a scene of the catalog, else "extent".
             Everything that the API returns is in the capture's own unit either way.
-        init: Start from the capture's 3D "points", or from "random" ones.
+        init: Start from the capture's 3D "points", from "dense" ones that a training computes from
+            its photographs, or from "random" ones.
         points: File of points to start from instead: PLY, or COLMAP's points3D.bin or points3D.txt,
             in the frame of the capture's poses.
         model: Which reconstruction of the capture is read if it has several: a folder ("sparse/1")

@@ -69,7 +69,8 @@ def load(data: Data, seed: int = 0, *, allow_no_points: bool = False, cache_byte
         else:
             capture = prepare.measure_extent(capture)
         capture = prepare.drop_outliers(capture)
-        if data.init == "random" or (capture.points is None and (capture.bounds is not None or raw.random_points)):
+        replaceable = data.init == "points" and (capture.bounds is not None or raw.random_points)
+        if data.init == "random" or (capture.points is None and replaceable):
             capture = _add_random_points(capture, seed, warn=data.init != "random")
         elif capture.points is None:
             capture = _check_no_points(capture, raw.points_source, allow_no_points)

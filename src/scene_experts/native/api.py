@@ -12,7 +12,7 @@ import ctypes
 from ctypes import POINTER, Structure, c_double, c_float, c_int32, c_int64, c_void_p
 from typing import Any
 
-ABI_VERSION = 10
+ABI_VERSION = 11
 
 HEAD_TENSORS = ("router_w", "router_b", "w1", "b1", "middle_w", "middle_b", "w2", "b2")
 """The weights of a decoder head, in the order of `SeDecodeHead`."""
@@ -76,7 +76,15 @@ class SeAdamTensor(Structure):
     ]
 
 
-STRUCTURES: tuple[type[Structure], ...] = (SeCamera, SeRasterForward, SeRasterBackward, SeDecodeHead, SeDecode, SeAdamTensor)
+class SeSweep(Structure):
+    _fields_ = [
+        *_fields(c_void_p, "grey", "start", "size", "camera", "compared", "planes", "inverse", "score"),
+        *_fields(c_int64, "views", "k", "count"),
+        ("threads", c_int32),
+    ]
+
+
+STRUCTURES: tuple[type[Structure], ...] = (SeCamera, SeRasterForward, SeRasterBackward, SeDecodeHead, SeDecode, SeAdamTensor, SeSweep)
 
 _P, _I, _L, _F, _D = c_void_p, c_int32, c_int64, c_float, c_double
 FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
@@ -109,6 +117,9 @@ FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "se_observe_rows": (None, (_P, _P, _L, _L, _P, _P, _I)),
     "se_observe_drawn": (None, (_P, _P, _P, _L, _P, _P, _I)),
     "se_mcmc_add_noise": (None, (_P, _P, _P, _P, _P, _L, _F, _F, _F, _I)),
+    "se_sweep_match": (_I, (POINTER(SeSweep),)),
+    "se_sweep_agree": (_I, (POINTER(SeSweep), _P, _P, _F, _F, _D, _P)),
+    "se_sweep_compare": (_I, (POINTER(SeSweep), _P, _L, _D, _D, _P, _P)),
 }
 """Result and argument types of every exported function, by name."""
 

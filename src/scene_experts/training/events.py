@@ -26,6 +26,8 @@ class Started:
     decode: str = ""
     """Which implementation decodes the scene in the first iteration, and why not the fused one;
     empty without a choice."""
+    start: str = ""
+    """Where the points that the scene starts from were computed: how many they are, and of what."""
     gradients: str = ""
     """On a GPU: whether training views are differentiated without autograd, and why not."""
 

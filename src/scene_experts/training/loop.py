@@ -18,6 +18,7 @@ from scene_experts.core.group import Alone
 from scene_experts.core.schedule import passes
 from scene_experts.core.types import Decoded, Mode, Render, Routing
 from scene_experts.data.capture import Capture
+from scene_experts.data.dense import start_densely
 from scene_experts.render import Rasterizer, for_training
 from scene_experts.scene import Scene
 from scene_experts.strategy import Edit
@@ -104,7 +105,7 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
     about = training.scene.describe_decode(training.step + 1)
     direct = direct_of(training, rasterize, training.scene)
     gradients = "" if direct is None else "through autograd (--shard)" if run.shard else direct.describe(training.scene, training.step + 1)
-    yield Started(training.step, total, training.scene.table.total, training.scene.traits, about, gradients)
+    yield Started(training.step, total, training.scene.table.total, training.scene.traits, about, training.computed, gradients)
     saved = training.step
     parts: Mapping[str, Tensor] = {}  # terms of the last iteration
     while training.step < total and not exchange.stopping:
@@ -166,16 +167,29 @@ def begin(cfg: Train, run: Job, capture: Capture, folder: Path | None, rasterize
         raise InputError("expected the training views that this run began with, found others; restore the file of --views, or train anew")
     if training is None and run.config.init_from is not None:
         training = Training.start_from(cfg, run.config.init_from, capture, run.device, run.config)
+        if run.config.data.init == "dense":
+            log.warning("--init dense has no effect with --init-from, whose scene is there already; leave it out")
         if training.step >= last_iteration(cfg, run):
             found = f"found {run.config.stop_at}; give a larger number or leave it out"
             raise InputError(f"expected --stop-at above {training.step}, where the run of --init-from ended, {found}")
-    training = training or Training.start(cfg, capture, run.device, run.dtype)
+    training = training or start(cfg, run, capture)
     if unused := find_unused(cfg):
         log.warning("these options have no effect with this recipe: %s; leave them out", ", ".join(unused))
     training.capture_id, training.poses, training.chosen = capture.fingerprint(), capture.poses(), capture.chosen()
     training.scene.set_training_cameras([capture.views[i].camera for i in capture.train])
     if run.max_memory > 0:
         fit_memory(training, run.max_memory, capture, lambda *view: see_view(training, run, capture, rasterize, *view))
+    return training
+
+
+def start(cfg: Train, run: Job, capture: Capture) -> Training:
+    """Start a training from the capture's points, or with --init dense from those of
+    `data.dense`. `cfg` must be scaled. Raises InputError as `train`."""
+    if run.config.data.init != "dense":
+        return Training.start(cfg, capture, run.device, run.dtype)
+    found = start_densely(capture, cfg.growth.max_anchors)
+    training = Training.start(cfg, replace(capture, points=found.points), run.device, run.dtype)
+    training.computed = found.describe()
     return training
 
 

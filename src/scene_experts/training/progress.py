@@ -72,6 +72,8 @@ class TrainingProgress:
                 self.traits, rows = event.traits, event.traits.rows
                 lattice = f" on a lattice of {event.traits.voxel:.3g}" if event.traits.voxel else ""
                 self.print_line(f"{verb}: {event.anchors:,} {rows}{lattice}, {event.total:,} iterations")
+                if event.start:
+                    self.print_line(f"start: {event.start}")
                 if event.decode:
                     self.print_line(f"decode: {event.decode}")
                 if event.gradients:

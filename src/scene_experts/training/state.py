@@ -54,6 +54,7 @@ class Training:
         self.direct: DirectStep | None = None
         self.clock = Clock()
         self.queue: list[int] = []
+        self.computed = ""  # of the points that the scene has just started from; for `Started.start`
         self.capture_id = self.poses = ""  # fingerprint and poses of the capture
         self.chosen: str | None = None  # `Capture.chosen`; None: not known
         self.views_rng = torch.Generator().manual_seed(cfg.seed)  # for the order of views and for backgrounds

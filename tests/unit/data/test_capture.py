@@ -203,6 +203,8 @@ def test_no_points(copy: Path) -> None:
     (copy / "sparse/0/points3D.bin").unlink()
     with pytest.raises(InputError, match=r"points3D\.bin.*--init random"):
         load(copy)
+    with pytest.raises(InputError, match=r"points3D\.bin.*--init random"):
+        load(copy, init="dense")
     looked = load(copy, allow_no_points=True)
     assert looked.points is None and any("--init random" in w for w in looked.warnings)
     capture = load(copy, init="random")

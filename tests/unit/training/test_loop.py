@@ -12,6 +12,7 @@ from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.schedule import Every
 from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
+from scene_experts.native import library as native
 from scene_experts.render import choose
 from scene_experts.scene.anchors.experts import Experts
 from scene_experts.scene.anchors.scene import Anchors
@@ -27,6 +28,7 @@ from support.captures import load
 from support.golden import recorded_text
 from support.lanes import slow_except
 from support.messages import naming
+from support.planes import make_planes, plane
 from support.scenes import METHODS
 from support.synthetic import make_capture
 from support.trainings import assert_same, config, events, last_tensors, start_changed
@@ -47,6 +49,19 @@ def test_resumed_equals_uninterrupted_bit_for_bit_while_rows_come_and_go(recipe,
     assert kinds[0] is Started
     second = list(events(cfg, folder, tmp_path / "parts", stop_at=80, resume=True))
     assert second[0].step == 60
+    assert_same(last_tensors(tmp_path / "whole"), last_tensors(tmp_path / "parts"))
+
+
+@pytest.mark.skipif(native.load() is None, reason="no compiled library")
+@pytest.mark.parametrize("recipe", slow_except(("scene-experts", "3dgs", "sags"), "scene-experts"))
+def test_a_dense_start_is_told_and_resumed_bit_for_bit(recipe, tmp_path):
+    cfg, folder = config(recipe), make_planes(tmp_path / "planes", plane(4.0))
+    plain = next(events(cfg, folder, stop_at=1))
+    begun, *_, last = events(cfg, folder, tmp_path / "whole", stop_at=8, init="dense")
+    assert "points by a plane sweep over 7 views" in begun.start and plain.start == "" and begun.anchors != plain.anchors
+    list(events(cfg, folder, tmp_path / "parts", stop_at=4, init="dense"))
+    resumed, *_ = events(cfg, folder, tmp_path / "parts", stop_at=8, init="dense", resume=True)
+    assert (resumed.step, resumed.start, type(last)) == (4, "", Finished)
     assert_same(last_tensors(tmp_path / "whole"), last_tensors(tmp_path / "parts"))
 
 

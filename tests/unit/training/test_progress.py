@@ -60,7 +60,7 @@ def test_a_narrow_terminal_shows_the_time_that_is_left():
 def test_rows_have_the_name_that_the_traits_state():
     out = io.StringIO()
     with TrainingProgress(Console(file=out, width=200), every=0.0) as show:
-        show(Started(0, 200, 1234, Traits("gaussians", "Gaussians")))
+        show(Started(0, 200, 1234, Traits("gaussians", "Gaussians"), start="1,234 points by a plane sweep"))
         show(Stepped(10, {"l1": 0.05}, 21.5, 1300, 800, 800, 0.0, 1.0, {}))
         show(Densified(100, Edit(10, 0, 1310, capped=True)))
     text = out.getvalue()
