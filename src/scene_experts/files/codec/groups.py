@@ -1,0 +1,176 @@
+"""Groups of channels, the integer models that predict them, and the walk that codes them.
+
+A channel's value is predicted, mean and spread, by two linear functions of what is decoded already:
+the level, the step class, earlier groups and earlier channels of the same anchor, and the weighted
+mean of the group's values at the anchor's parents (`order`). Weights are 8-bit and sums 32-bit
+integers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_experts.core.reading.budget import Damaged
+from scene_experts.files.codec.order import LEVELS, CodingOrder
+from scene_experts.files.codec.reference import Ints
+from scene_experts.files.codec.streams import MOST_INPUTS, SymbolReader, SymbolWriter, as_inputs, blend, predict
+
+LOW_CLASS, HIGH_CLASS = -2, 4
+"""Least and largest step class: an anchor's steps are 2^class times those of the channels."""
+CLASSES = HIGH_CLASS - LOW_CLASS + 1
+UNIT = 32  # an input of 32 is one standard deviation, or "yes"
+MOST_FACTOR, MOST_OFFSET, MOST_BIAS, MOST_SHIFT = 1 << 20, 1 << 28, 1 << 28, 24
+CLASS, FEATURE, SCALING, EXTRA, SLOTS, OFFSETS = "class", "feature", "scaling", "extra", "slots", "offsets"
+
+
+@dataclass(frozen=True)
+class Group:
+    """Channels that are coded one after the other."""
+
+    name: str
+    channels: int
+    own: tuple[str, ...] = ()
+    """Earlier groups of the same anchor that predict it."""
+    from_parents: bool = True
+    is_chain: bool = True
+    """Whether earlier channels of the group predict later ones."""
+    is_binary: bool = False
+    has_steps: bool = True
+    """Whether the anchor's class scales its steps. Then the class predicts the group too."""
+    masked: int = 0
+    """Channels of each slot, if those of masked slots are left out; 0: none are."""
+
+
+def anchor_groups(F: int, K: int, has_slots: bool = False, extra: int = 0) -> tuple[Group, ...]:
+    """The groups of anchors with F features, six lengths, `extra` further columns and K
+    Gaussians."""
+    slots = (Group(SLOTS, K, (FEATURE,), is_binary=True, has_steps=False),) if has_slots else ()
+    others = (Group(EXTRA, extra, (SCALING,), has_steps=False),) if extra else ()
+    return (
+        Group(CLASS, 1, has_steps=False),
+        Group(FEATURE, F),
+        Group(SCALING, 6, (FEATURE,)),
+        *others,
+        *slots,
+        Group(OFFSETS, 3 * K, (FEATURE, SCALING), from_parents=False, is_chain=False, masked=3 if has_slots else 0),
+    )
+
+
+@dataclass(frozen=True)
+class GroupModel:
+    """The model of one group of C channels."""
+
+    weights: list[NDArray[np.int8]]
+    """[2, D] each, of the mean and of the spread; D grows along a chain."""
+    numbers: Ints
+    """[C, 4]: bias and shift of the mean, bias and shift of the spread."""
+    scaling: Ints
+    """[C, 2]: factor and offset that make inputs of the values (`reference.as_inputs`)."""
+
+    def checked(self) -> GroupModel:
+        """This model. Raises Damaged for numbers that the sums could not bear."""
+        biases, shifts = self.numbers[:, ::2], self.numbers[:, 1::2]
+        factor, offset = self.scaling.T
+        fits = np.abs(biases.astype(np.int64)).max(initial=0) <= MOST_BIAS and np.abs(shifts).max(initial=0) <= MOST_SHIFT
+        if not fits or ((factor < 1) | (factor > MOST_FACTOR)).any() or np.abs(offset.astype(np.int64)).max(initial=0) > MOST_OFFSET:
+            raise Damaged("a model with numbers out of range")
+        return self
+
+
+def inputs_of(group: Group, channels: Mapping[str, int]) -> list[int]:
+    """How many inputs each channel of a group has. channels: of the groups by name."""
+    fixed = LEVELS + (CLASSES if group.has_steps else 0) + sum(channels[name] for name in group.own)
+    fixed += group.channels if group.from_parents else 0
+    found = [fixed + (c if group.is_chain else 0) for c in range(group.channels)]
+    if found and found[-1] > MOST_INPUTS:
+        raise Damaged(f"{found[-1]:,} inputs of a model, more than {MOST_INPUTS:,}")
+    return found
+
+
+class Walk:
+    """Codes the values of all groups, level by level. One walk writes, another one reads the same.
+
+    values: by group, [C, N] int32 in coding order. Readers begin with zeros.
+    """
+
+    def __init__(self, groups: Sequence[Group], order: CodingOrder, models: Mapping[str, GroupModel], slow: bool = False) -> None:
+        self.groups, self.order, self.models, self.slow = groups, order, models, slow
+        self.count = sum(map(len, order.rows))
+        self.values = {g.name: np.zeros((g.channels, self.count), np.int32) for g in groups}
+        self._columns = {g.name: np.zeros((g.channels, self.count), np.int16) for g in groups}
+
+    def write(self, values: Mapping[str, Ints]) -> dict[str, SymbolWriter]:
+        """The streams by group of values by group."""
+        self.values = {name: np.ascontiguousarray(value, np.int32) for name, value in values.items()}
+        out = {group.name: SymbolWriter(self.slow) for group in self.groups}
+
+        def code(group: Group, channel: int, rows: Ints, mean: Ints, scale: Ints) -> Ints:
+            found = self.values[group.name][channel, rows]
+            if group.is_binary:
+                out[group.name].bits(found.astype(np.uint8), scale)
+            else:
+                out[group.name].symbols(found, mean, scale)
+            return found
+
+        self._run(code)
+        return out
+
+    def read(self, streams: Mapping[str, bytes]) -> dict[str, Ints]:
+        """The values by group of streams by group. Raises Damaged for streams that do not fit."""
+        readers = {group.name: SymbolReader(streams[group.name], self.slow) for group in self.groups}
+
+        def code(group: Group, channel: int, rows: Ints, mean: Ints, scale: Ints) -> Ints:
+            reader = readers[group.name]
+            found = reader.bits(scale).astype(np.int32) if group.is_binary else reader.symbols(mean, scale)
+            if group.name == CLASS and len(found) and not LOW_CLASS <= found.min() <= found.max() <= HIGH_CLASS:
+                raise Damaged("a step class out of range")
+            self.values[group.name][channel, rows] = found
+            return found
+
+        self._run(code)
+        for reader in readers.values():
+            reader.finish()
+        return self.values
+
+    def _run(self, code) -> None:  # type: ignore[no-untyped-def]
+        for level, rows in enumerate(self.order.rows):
+            for group in self.groups if len(rows) else ():
+                self._run_group(group, level, rows, code)
+
+    def _run_group(self, group: Group, level: int, rows: Ints, code) -> None:  # type: ignore[no-untyped-def]
+        model, classes = self.models[group.name], self._classes(group, rows)
+        inputs, used = self.inputs(group, level, rows, classes)
+        for c in range(group.channels):
+            mean, scale = predict(inputs, used, model.weights[c], model.numbers[c].tolist(), classes, self.slow)
+            if group.masked:
+                live = self.values[SLOTS][c // group.masked, rows] != 0
+                found = np.zeros(len(rows), np.int32)
+                found[live] = code(group, c, rows[live], mean[live], scale[live])
+            else:
+                found = code(group, c, rows, mean, scale)
+            column = as_inputs(found, classes, *self.models[group.name].scaling[c].tolist(), slow=self.slow)
+            self._columns[group.name][c, rows] = column
+            if group.is_chain:
+                inputs[used] = column
+                used += 1
+
+    def _classes(self, group: Group, rows: Ints) -> NDArray[np.int8]:
+        return self.values[CLASS][0, rows].astype(np.int8) if group.has_steps else np.zeros(len(rows), np.int8)
+
+    def inputs(self, group: Group, level: int, rows: Ints, classes: NDArray[np.int8]) -> tuple[NDArray[np.int16], int]:
+        """The inputs [D, n] of a group's last channel at the rows of a level, and how many of them
+        the first channel has; the rest is empty yet."""
+        fixed = [np.repeat((np.arange(LEVELS) == level)[:, None], len(rows), 1) * UNIT]
+        if group.has_steps:
+            fixed.append((np.arange(LOW_CLASS, HIGH_CLASS + 1)[:, None] == classes) * UNIT)
+        fixed += [self._columns[name][:, rows] for name in group.own]
+        if group.from_parents:
+            fixed.append(blend(self._columns[group.name], *self.order.parents[level], slow=self.slow))
+        used = sum(map(len, fixed))
+        out = np.empty((used + (group.channels if group.is_chain else 0), len(rows)), np.int16)
+        np.concatenate(fixed, out=out[:used], casting="unsafe")
+        return out, used
