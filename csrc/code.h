@@ -25,7 +25,7 @@ const CodeTables& code_tables();
 // One step of the coder: a share [start, start + width) of 2^15.
 inline uint32_t code_operation(uint32_t start, uint32_t width) { return start << 16 | width; }
 
-// Reads shares from words. `failed` is set, and zeros are returned, where the words end too early.
+// Reads shares from words, at least one. `failed` is set where they end too early; what is read from there on means nothing.
 class CodeInput {
  public:
   CodeInput(const uint16_t* words, int64_t count, int64_t at, int64_t operations, const int64_t* state)
@@ -38,15 +38,11 @@ class CodeInput {
   void take(uint32_t start, uint32_t width) {
     uint32_t& x = state_[operations_++ & (kCodeLanes - 1)];
     x = width * (x >> kCodeBits) + (x & ((1u << kCodeBits) - 1)) - start;
-    if (x < kCodeFloor) {
-      if (at_ >= count_ || x == 0) {
-        failed_ = true;
-        x = kCodeFloor;
-        return;
-      }
-      x = x << 16 | words_[at_++];
-      if (x < kCodeFloor) x = kCodeFloor, failed_ = true;
-    }
+    const bool more = x < kCodeFloor;  // without a branch, which would often be predicted wrongly
+    failed_ |= more && at_ >= count_;
+    const uint32_t word = words_[at_ < count_ ? at_ : count_ - 1];
+    x = more ? x << 16 | word : x;
+    at_ += more;
   }
   uint32_t raw(int bits) {  // 1 .. 15
     const int shift = kCodeBits - bits;

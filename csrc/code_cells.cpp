@@ -3,6 +3,7 @@
 // src/scene_experts/files/codec/reference.py.
 #include <algorithm>
 #include <cstdint>
+#include <utility>
 #include <vector>
 
 #include "code.h"
@@ -13,7 +14,6 @@ namespace {
 using se::kCodeBits;
 constexpr int kDepths = 4, kStates = 64;         // deeper levels share the last depth's contexts; states across the faces
 constexpr uint32_t kMostSeen = 1023;             // counts are halved beyond it
-constexpr uint64_t kAxis = 0x1249249249249249u;  // the bits of x in a key
 
 struct Count {
   uint16_t zeros = 0, ones = 0;
@@ -33,92 +33,73 @@ struct Count {
   }
 };
 
-// The nodes of one level by key.
-class Nodes {
- public:
-  explicit Nodes(const std::vector<uint64_t>& keys) {
-    int bits = 4;
-    while ((size_t{1} << bits) < 2 * keys.size()) ++bits;
-    shift_ = 64 - bits;
-    mask_ = (size_t{1} << bits) - 1;
-    slots_.assign(size_t{1} << bits, -1);
-    keys_ = keys.data();
-    for (size_t i = 0; i < keys.size(); ++i) {
-      size_t at = hash(keys[i]);
-      while (slots_[at] >= 0) at = (at + 1) & mask_;
-      slots_[at] = static_cast<int32_t>(i);
-    }
-  }
-  int32_t find(uint64_t key) const {  // -1: none
-    size_t at = hash(key);
-    while (slots_[at] >= 0) {
-      if (keys_[slots_[at]] == key) return slots_[at];
-      at = (at + 1) & mask_;
-    }
-    return -1;
-  }
+// The nodes of one level, and where their children begin on the next one.
+struct Nodes {
+  std::vector<uint64_t> keys;
+  std::vector<int32_t> beside;     // [n, 3, 2]: the nodes across the faces, -1: none
+  std::vector<uint8_t> children;   // masks
+  std::vector<int32_t> first;
 
- private:
-  size_t hash(uint64_t key) const { return (key * 0x9E3779B97F4A7C15u) >> shift_; }
-  std::vector<int32_t> slots_;
-  const uint64_t* keys_;
-  size_t mask_;
-  int shift_;
+  int32_t child(int32_t node, int which) const {  // its number on the next level, -1: none
+    if (node < 0 || !(children[node] >> which & 1)) return -1;
+    return first[node] + __builtin_popcount(children[node] & ((1u << which) - 1));
+  }
 };
 
-// The key one step along an axis; `depth` bits per axis. False at the border of the cube.
-inline bool step(uint64_t key, int axis, bool up, int depth, uint64_t* out) {
-  const uint64_t bits = (kAxis & ((uint64_t{1} << (3 * depth)) - 1)) << axis, own = key & bits;
-  if (own == (up ? bits : 0)) return false;
-  const uint64_t moved = up ? ((key | ~bits) + (uint64_t{1} << axis)) & bits : (own - (uint64_t{1} << axis)) & bits;
-  *out = (key & ~bits) | moved;
-  return true;
-}
-
-// Walk the tree. `ask(level, share, node, child)` codes one bit and returns it. False: more than `most` nodes.
+// Walk the tree. `ask(level, share, key of the child)` codes one bit and returns it. False: more than `most` nodes.
 template <class Ask>
-bool walk(int depth, int64_t most, std::vector<uint64_t>* nodes, Ask&& ask) {
+bool walk(int depth, int64_t most, std::vector<uint64_t>* leaves, Ask&& ask) {
   std::vector<Count> counts(size_t{kDepths} * 8 * kStates);
-  nodes->assign(1, 0);
-  std::vector<uint8_t> children;
-  std::vector<uint64_t> next;
+  Nodes now, next;
+  now.keys.assign(1, 0);
+  now.beside.assign(6, -1);
   for (int level = 0; level < depth; ++level) {
-    const Nodes known(*nodes);
     const int left = std::min(depth - 1 - level, kDepths - 1);
-    children.assign(nodes->size(), 0);
-    next.clear();
-    for (size_t i = 0; i < nodes->size(); ++i) {
-      int32_t beside[3][2];
-      for (int a = 0; a < 3; ++a)
-        for (int up = 0; up < 2; ++up) {
-          uint64_t key;
-          beside[a][up] = step((*nodes)[i], a, up, level, &key) ? known.find(key) : -1;
-        }
+    const size_t n = now.keys.size();
+    now.children.assign(n, 0);
+    now.first.resize(n);
+    next.keys.clear();
+    for (size_t i = 0; i < n; ++i) {
+      const int32_t* beside = now.beside.data() + 6 * i;
+      now.first[i] = static_cast<int32_t>(next.keys.size());
       unsigned own = 0;
       for (int b = 0; b < 8; ++b) {
         bool one = b == 7 && !own;  // a node has a child
         if (!one) {
           int state = 0;
           for (int a = 0; a < 3; ++a) {
-            const bool high = b >> a & 1;
-            const int32_t node = beside[a][high];
-            const int side = high ? 2 * (own >> (b ^ (1 << a)) & 1) + (node >= 0) : node < 0 ? 0 : 1 + (children[node] >> (b ^ (1 << a)) & 1);
+            const int high = b >> a & 1, other = b ^ 1 << a;
+            const int32_t node = beside[2 * a + high];
+            const int side = high ? 2 * (own >> other & 1) + (node >= 0) : node < 0 ? 0 : 1 + (now.children[node] >> other & 1);
             state = 4 * state + side;
           }
           Count& count = counts[(left * 8 + b) * kStates + state];
-          one = ask(level, count.share(), i, b);
+          one = ask(level, count.share(), now.keys[i] << 3 | b);
           count.add(one);
         }
         if (one) {
           own |= 1u << b;
-          next.push_back((*nodes)[i] << 3 | b);
+          next.keys.push_back(now.keys[i] << 3 | b);
         }
       }
-      children[i] = static_cast<uint8_t>(own);
-      if (static_cast<int64_t>(next.size()) > most) return false;
+      now.children[i] = static_cast<uint8_t>(own);
+      if (static_cast<int64_t>(next.keys.size()) > most) return false;
     }
-    nodes->swap(next);
+    if (level + 1 < depth) {
+      next.beside.resize(6 * next.keys.size());
+      int32_t* out = next.beside.data();
+      for (size_t i = 0; i < n; ++i)
+        for (int b = 0; b < 8; ++b)
+          if (now.children[i] >> b & 1)
+            for (int a = 0; a < 3; ++a)
+              for (int up = 0; up < 2; ++up) {
+                const bool inside = (b >> a & 1) != up;
+                *out++ = now.child(inside ? static_cast<int32_t>(i) : now.beside[6 * i + 2 * a + up], b ^ 1 << a);
+              }
+    }
+    std::swap(now, next);
   }
+  leaves->swap(now.keys);
   return true;
 }
 }  // namespace
@@ -126,13 +107,12 @@ bool walk(int depth, int64_t most, std::vector<uint64_t>* nodes, Ask&& ask) {
 SE_EXPORT int64_t se_code_cells(const int64_t* keys, int64_t count, int32_t depth, uint32_t* operations, int64_t capacity) {
   int64_t written = 0;
   const int status = se::run_guarded([&] {
-    std::vector<uint64_t> nodes;
+    std::vector<uint64_t> leaves;
     int64_t at = 0;  // the first key that is not before the child
     int last = 0;
-    walk(depth, count, &nodes, [&](int level, uint32_t zeros, size_t node, int child) {
+    walk(depth, count, &leaves, [&](int level, uint32_t zeros, uint64_t key) {
       if (level != last) last = level, at = 0;
       const int shift = 3 * (depth - 1 - level);
-      const uint64_t key = nodes[node] << 3 | static_cast<uint64_t>(child);
       while (at < count && static_cast<uint64_t>(keys[at]) >> shift < key) ++at;
       const bool one = at < count && static_cast<uint64_t>(keys[at]) >> shift == key;
       if (written < capacity)
@@ -146,16 +126,16 @@ SE_EXPORT int64_t se_code_cells(const int64_t* keys, int64_t count, int32_t dept
 
 SE_EXPORT int32_t se_code_read_cells(SeCodeReader* reader, int32_t depth, int64_t count, int64_t* keys) {
   se::CodeInput input(reader->words, reader->count, reader->at, reader->operations, reader->state);
-  std::vector<uint64_t> nodes;
+  std::vector<uint64_t> leaves;
   bool whole = false;
   const int status = se::run_guarded([&] {
-    whole = walk(depth, count, &nodes, [&](int, uint32_t zeros, size_t, int) { return input.bit(zeros); });
+    whole = walk(depth, count, &leaves, [&](int, uint32_t zeros, uint64_t) { return input.bit(zeros); });
   });
   if (status) return status;
   reader->at = input.at();
   reader->operations = input.operations();
   for (int i = 0; i < se::kCodeLanes; ++i) reader->state[i] = input.state(i);
-  if (!whole || input.failed() || static_cast<int64_t>(nodes.size()) != count) return se::kDamaged;
-  std::copy(nodes.begin(), nodes.end(), keys);
+  if (!whole || input.failed() || static_cast<int64_t>(leaves.size()) != count) return se::kDamaged;
+  std::copy(leaves.begin(), leaves.end(), keys);
   return 0;
 }

@@ -22,15 +22,17 @@ SE_EXPORT void se_code_predict(const int16_t* inputs, int64_t stride, const int8
   for (int64_t begin = 0; begin < count; begin += kRows) {
     const int64_t n = std::min(kRows, count - begin);
     int32_t sums[2][kRows];
-    for (int which = 0; which < 2; ++which) {
-      int32_t* sum = sums[which];
-      std::fill(sum, sum + n, numbers[2 * which]);
-      for (int64_t d = 0; d < D; ++d) {
-        const int32_t w = weights[which * D + d];
-        const int16_t* x = inputs + d * stride + begin;
-        if (w)
-          for (int64_t i = 0; i < n; ++i) sum[i] += w * x[i];
-      }
+    std::fill(sums[0], sums[0] + n, numbers[0]);
+    std::fill(sums[1], sums[1] + n, numbers[2]);
+    for (int64_t d = 0; d < D; ++d) {
+      const int32_t w = weights[d], v = weights[D + d];
+      const int16_t* x = inputs + d * stride + begin;
+      if (w && v)
+        for (int64_t i = 0; i < n; ++i) sums[0][i] += w * x[i], sums[1][i] += v * x[i];
+      else if (w)
+        for (int64_t i = 0; i < n; ++i) sums[0][i] += w * x[i];
+      else if (v)
+        for (int64_t i = 0; i < n; ++i) sums[1][i] += v * x[i];
     }
     for (int64_t i = 0; i < n; ++i) {
       const int32_t fine = classes[begin + i] + 2;

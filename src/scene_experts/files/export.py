@@ -171,7 +171,7 @@ def _check(options: Options) -> None:
 
         parse_crop(options.crop)
     if not 0 < options.quality < math.inf:
-        raise InputError(f"expected --quality above 0 dB, found {options.quality}; 0.1 is usual")
+        raise InputError(f"expected --quality above 0 dB, found {options.quality}; 0.2 is usual")
     if not 0 <= options.target_mb < math.inf:
         raise InputError(f"expected --target-mb as megabytes above 0, found {options.target_mb}; correct it")
     if options.target_mb and options.quality != DEFAULT.quality:

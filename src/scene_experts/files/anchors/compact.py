@@ -30,7 +30,7 @@ from scene_experts.files.anchors.quality import choose_precision
 from scene_experts.files.anchors.rounding import FURTHER, WholeScene, restore, round_scene
 from scene_experts.files.codec import container
 from scene_experts.files.codec.fit import fit_models
-from scene_experts.files.codec.groups import EXTRA, FEATURE, OFFSETS, SCALING, SLOTS, Walk, anchor_groups
+from scene_experts.files.codec.groups import EXTRA, FEATURE, OFFSETS, ORDER, SCALING, SLOTS, Walk, anchor_groups
 from scene_experts.files.codec.numbers import Rounded, code_models, code_rounded, reading, writing
 from scene_experts.files.codec.order import CodingOrder, choose_boxes
 from scene_experts.files.codec.streams import SymbolReader, SymbolWriter
@@ -81,15 +81,16 @@ def write(path: Path, data: AnchorData, note: dict[str, Any]) -> Sizes:
 
 def encode(data: AnchorData) -> tuple[bytes, Sizes]:
     """The bytes of a scene's file, and their sizes. Raises InputError as `write`."""
-    places, order = find_places(data)
-    n, F, K = len(order), data.columns["feature"].shape[1], data.columns["offsets"].shape[1]
+    places, along = find_places(data)
+    n, F, K = len(along), data.columns["feature"].shape[1], data.columns["offsets"].shape[1]
     if F > MOST_CHANNELS or K > MOST_SLOTS:
         raise InputError(f"expected at most {MOST_CHANNELS} channels and {MOST_SLOTS} Gaussians for a compact file, found {F} and {K}")
     whole = round_scene(data)
-    values = {name: np.ascontiguousarray(value[:, order]) for name, value in whole.values.items()}
-    groups = anchor_groups(F, K, SLOTS in values, len(whole.extra))
     boxes = choose_boxes(places.keys)
-    way = CodingOrder.of(places.keys, places.fine, boxes)
+    way = CodingOrder.of(places.keys, boxes)
+    places, along = places.ordered(way.rows), along[way.rows]
+    values = {name: np.ascontiguousarray(value[:, along]) for name, value in whole.values.items()}
+    groups = anchor_groups(F, K, SLOTS in values, len(whole.extra))
     models = fit_models(groups, way, values)
     cells, numbers, weights = SymbolWriter(), SymbolWriter(), SymbolWriter()
     write_places(places, cells)
@@ -115,20 +116,21 @@ def encode(data: AnchorData) -> tuple[bytes, Sizes]:
         "boxes": list(boxes),
         "networks": [[name, list(data.networks[name].shape)] for name in (*whole.networks, *whole.exact)],
         "rounded": len(whole.networks),
-        "integers": checksum(places, values, whole.networks),
+        "integers": checksum(places, replace(whole, values=values)),
         "scene": data.about,
     }
     encoded = container.join(header, parts)
     return encoded, Sizes(len(encoded), {name: len(part) for name, part in parts.items()}, n)
 
 
-def checksum(places: Places, values: dict[str, Any], networks: dict[str, Rounded]) -> int:
-    """CRC-32 of all whole numbers as 32 bits, low byte first: fine cells [N, 3], then the groups [C,
-    N], then values [E, R, C] and exponents [R] of the networks."""
+def checksum(places: Places, whole: WholeScene) -> int:
+    """CRC-32 of all numbers, 32 bits each, low byte first: fine cells [N, 3], the groups [C, N], values
+    [E, R, C] and exponents [R] of each network, then the tensors that are held as they are."""
     found = 0
-    arrays = [places.fine, *values.values(), *(a for r in networks.values() for a in (r.values, r.exponents))]
-    for array in arrays:
-        found = zlib.crc32(np.ascontiguousarray(array, "<i4").tobytes(), found)
+    for array in (places.fine, *(whole.values[name] for name in ORDER if name in whole.values), *(a for r in whole.networks.values() for a in (r.values, r.exponents))):
+        found = zlib.crc32(np.ascontiguousarray(array, "<i4").data, found)
+    for array in whole.exact.values():
+        found = zlib.crc32(np.ascontiguousarray(array, "<f4").data, found)
     return found
 
 
@@ -162,7 +164,8 @@ def _decode(source: Source) -> AnchorData:
     source.check_time()
     groups = anchor_groups(F, K, bool(header["slots"]), len(extra))
     first, second = (whole_number(v, "the bits of a box", 0, 63) for v in header["boxes"])
-    way = CodingOrder.of(places.keys, places.fine, (first, second))
+    way = CodingOrder.of(places.keys, (first, second))
+    places = places.ordered(way.rows)
     stream = SymbolReader(parts[MODELS])
     models = code_models(reading(stream), groups, None)
     stream.finish()
@@ -170,7 +173,7 @@ def _decode(source: Source) -> AnchorData:
     source.check_time()
     count = whole_number(header["rounded"], "the number of networks", 0, len(shapes))
     whole = WholeScene(values, _steps(header["steps"], F, K, extra), extra, *_networks(parts, shapes, count))
-    if checksum(places, values, whole.networks) != header["integers"]:
+    if checksum(places, whole) != header["integers"]:
         raise Damaged("numbers with another checksum")
     about = dict(header["scene"]) if header["scene"] is not None else None
     columns = places.columns(origin)  # type: ignore[arg-type]

@@ -62,7 +62,7 @@ class Lattice:
 
 @dataclass(frozen=True)
 class Places:
-    """Where N anchors are, in coding order."""
+    """Where N anchors are, in coding order, or along the Morton curve."""
 
     lattices: list[Lattice]
     cells: NDArray[np.int64]
@@ -70,7 +70,7 @@ class Places:
     lattice: NDArray[np.int64]
     """[N], index of their lattice"""
     keys: Keys
-    """[N], Morton keys on the finest lattice, ascending"""
+    """[N], Morton keys on the finest lattice"""
 
     @property
     def fine(self) -> Ints:
@@ -82,6 +82,10 @@ class Places:
         edges = np.array([lattice.edge for lattice in self.lattices] or [1.0])
         xyz = self.cells * edges[self.lattice][:, None] + np.array(origin)
         return {"xyz": torch.from_numpy(xyz.astype(np.float32))}
+
+    def ordered(self, rows: NDArray[Any]) -> Places:
+        """The places of rows [N]."""
+        return Places(self.lattices, self.cells[rows], self.lattice[rows], self.keys[rows])
 
     def levels(self) -> Tensor:
         """The level of detail [N] int64 of each anchor."""
@@ -108,7 +112,8 @@ def find_places(data: AnchorData) -> tuple[Places, NDArray[np.int64]]:
         corner = own.min(0)
         depth = int((own.max(0) - corner).max()).bit_length()
         x, y, z = corner.tolist()
-        lattices.append(Lattice(j, float(edges[j]), multiples[i], (x, y, z), len(own), len(np.unique(own, axis=0)), depth))
+        distinct = len(np.unique(keys[lattice == i]))
+        lattices.append(Lattice(j, float(edges[j]), multiples[i], (x, y, z), len(own), distinct, depth))
     return Places(lattices, cells[order], lattice[order], keys[order]), order
 
 
@@ -131,7 +136,7 @@ def _from_zero(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.
 def write_places(places: Places, writer: SymbolWriter) -> None:
     """Append the cells of all lattices."""
     for i, lattice in enumerate(places.lattices):
-        keys = np.sort(morton(places.cells[places.lattice == i] - np.array(lattice.low)))
+        keys = morton(places.cells[places.lattice == i] - np.array(lattice.low))
         distinct, counts = np.unique(keys, return_counts=True)
         writer.cells(distinct.astype(np.int64), lattice.depth)
         if lattice.distinct < lattice.count:

@@ -20,7 +20,7 @@ from scene_experts.files.codec.groups import HIGH_CLASS, LOW_CLASS
 LEAST_SHARE = 1e-3  # of the mean sensitivity, that every channel has
 STACKED = ("w1", "b1", "w2", "b2")  # tensors whose first axis is the experts'
 ROUNDED = ("feature", "log_scaling", "offsets")
-_FINE = {"feature": 64.0, "log_scaling": 64.0, "offsets": 64.0}  # steps of a deviation, without sensitivities
+_FINE = 64.0  # steps of a deviation, without sensitivities
 _FINE_ROWS = 128.0  # of a root mean square
 
 
@@ -88,8 +88,10 @@ def from_spread(columns: Mapping[str, Tensor], networks: Mapping[str, Tensor]) -
     steps = {}
     for name in ROUNDED:
         flat = columns[name].detach().double().flatten(1)
-        spread = flat.std(0, correction=0) if len(flat) else torch.ones(flat.shape[1], dtype=torch.float64)
-        steps[name] = coarse(spread.clamp_min(max(float(spread.mean()) * LEAST_SHARE, 1e-6)) / _FINE[name])
+        if not len(flat):
+            flat = torch.ones(1, flat.shape[1], dtype=torch.float64)
+        spread, size = flat.std(0, correction=0), flat.square().mean(0).sqrt()
+        steps[name] = coarse(torch.maximum(spread, size * LEAST_SHARE).clamp_min(max(float(spread.mean()) * LEAST_SHARE, 1e-6)) / _FINE)
     rows = {}
     for name, value in networks.items():
         if not is_exact(name):

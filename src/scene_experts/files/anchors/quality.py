@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import cast
 
 import torch
+from torch import Tensor
 
 from scene_experts.core.errors import InputError
 from scene_experts.data.views import Capture, World
@@ -24,6 +25,7 @@ from scene_experts.files.options import Options
 from scene_experts.files.placed import place_cameras
 from scene_experts.files.scene_folder import origin_of
 from scene_experts.render import Rasterizer, as_trained, choose
+from scene_experts.scene import Scene
 from scene_experts.scene.anchors.scene import AnchorScene
 from scene_experts.training.run_folder import OpenRun
 
@@ -55,33 +57,37 @@ class Judge:
         difference between the pictures, as if the run had 32 dB."""
         return len(self.capture.images) > 0
 
-    @cached_property
-    def _own(self) -> Painter:
-        return Painter.of(self.run.scene, self.run.step, self.rasterize, self.run.config.train.antialias)
+    def _painter(self, scene: Scene, step: int) -> Painter:
+        return Painter.of(scene, step, self.rasterize, self.run.config.train.antialias)
 
     @cached_property
-    def _before(self) -> float:
-        return self._score(self._own)
+    @torch.no_grad()
+    def _before(self) -> list[tuple[Tensor, float]]:
+        """By view: the run's picture as bytes, and its mean square error."""
+        painter, background, out = self._painter(self.run.scene, self.run.step), torch.tensor(self.capture.background), []
+        for index in self.views:
+            image = painter.picture_8bit(self.capture.views[index].camera, background)
+            out.append(((image * 255).round().to(torch.uint8), self._error(index, image)))
+        return out
+
+    def _error(self, index: int, image: Tensor) -> float:
+        if not self.has_photographs:
+            return UNKNOWN_ERROR
+        frame = self.capture.frame(index)
+        return 10 ** (-0.1 * psnr(image, frame.rgb.float() / 255, frame.mask))
 
     @torch.no_grad()
-    def _score(self, painter: Painter) -> float:
-        """Mean PSNR over the views, dB."""
-        background, total = torch.tensor(self.capture.background), 0.0
-        for index in self.views:
-            camera = self.capture.views[index].camera
-            image = painter.picture_8bit(camera, background)
-            if self.has_photographs:
-                frame = self.capture.frame(index)
-                total += psnr(image, frame.rgb.float() / 255, frame.mask)
-            else:
-                error = float((image - self._own.picture_8bit(camera, background)).double().square().mean())
-                total -= 10 * math.log10(UNKNOWN_ERROR + error)
-        return total / len(self.views)
-
     def loss(self, contents: AnchorData) -> float:
-        """What contents lose against the run, dB."""
-        scene, step = scene_of(self.run, contents, self.world)
-        return self._before - self._score(Painter.of(scene, step, self.rasterize, self.run.config.train.antialias))
+        """What contents lose against the run, dB: the mean over the views. Of a scene whose errors a
+        rounding happens to mend, it is what the difference between the pictures would cost."""
+        painter, total = self._painter(*scene_of(self.run, contents, self.world)), 0.0
+        background = torch.tensor(self.capture.background)
+        for index, (own, error) in zip(self.views, self._before):
+            image = painter.picture_8bit(self.capture.views[index].camera, background)
+            away = float((image - own.float() / 255).double().square().mean())
+            after = max(error + away, self._error(index, image) if self.has_photographs else 0.0)
+            total += 10 * math.log10(after / error)
+        return total / len(self.views)
 
 
 def _shows(capture: Capture, index: int) -> bool:

@@ -24,7 +24,7 @@ from scene_experts.files.codec.numbers import Rounded
 from scene_experts.files.codec.reference import Ints
 
 MOST_SYMBOL = 1 << 30
-FURTHER = {"interval": 0.02, "extra_level": 1 / 128}
+FURTHER = {"interval": 0.02, "extra_level": 0.008}
 """Columns of one value, with their steps: the logarithm of an interval, and the share of a
 level."""
 _LEAST_INTERVAL = 1e-30
@@ -122,7 +122,7 @@ def restore(whole: WholeScene, data: AnchorData, shapes: Mapping[str, tuple[int,
     for name, steps in whole.steps.items():
         value = v[name] * np.array(steps, np.float64)[:, None] * (1.0 if name == EXTRA else factor)
         floats[name] = torch.from_numpy(np.ascontiguousarray(value.T, np.float32))
-    columns = {"feature": floats[FEATURE], "log_scaling": floats[SCALING], "offsets": floats[OFFSETS].reshape(n, -1, 3)}
+    columns = {"feature": floats[FEATURE], "log_scaling": floats[SCALING], "offsets": floats[OFFSETS].reshape(n, len(v[OFFSETS]) // 3, 3)}
     for i, name in enumerate(whole.extra):
         value = floats[EXTRA][:, i].clone()
         columns[name] = value.clamp(-69.0, 34.0).exp() if name == "interval" else value

@@ -44,35 +44,24 @@ def fit_models(groups: Sequence[Group], order: CodingOrder, values: Mapping[str,
     models = {g.name: _blank(g, channels, values) for g in groups}
     walk = Walk(groups, order, models)
     walk.values = {name: np.ascontiguousarray(value, np.int32) for name, value in values.items()}
-    chosen = [_some(rows, walk.count) for rows in order.rows]
+    every = max(1, -(-walk.count // ROWS))
     for group in groups:
-        classes = walk._classes(group, np.arange(walk.count, dtype=np.int32))
+        classes = walk.classes(group, slice(0, walk.count))
         for c in range(group.channels):
-            walk._columns[group.name][c] = as_inputs(walk.values[group.name][c], classes, *models[group.name].scaling[c].tolist())
+            walk.columns[group.name][c] = as_inputs(walk.values[group.name][c], classes, *models[group.name].scaling[c].tolist())
         if not walk.count:
             continue
-        parts, kept = [], []
-        for level in range(LEVELS):
-            pick = chosen[level]
-            rows = order.rows[level]
-            if not len(rows):
-                continue
-            inputs, used = walk.inputs(group, level, rows, classes[rows])
+        parts = []
+        for level, places in enumerate(order.levels):
+            inputs, used = walk.inputs(group, level, places)
             if group.is_chain:
-                inputs[used:] = walk._columns[group.name][:, rows]
-            parts.append(inputs[:, pick])
-            kept.append(rows[pick])
-        rows = np.concatenate(kept)
+                inputs[used:] = walk.columns[group.name][:, places]
+            parts.append(inputs[:, ::every])
+        rows = np.concatenate([np.arange(places.start, places.stop, every) for places in order.levels])
         live = walk.values[SLOTS][:, rows] != 0 if group.masked else None
         with one_thread():
             models[group.name] = _fit(group, models[group.name], np.concatenate(parts, 1), walk.values[group.name][:, rows], classes[rows], live)
     return models
-
-
-def _some(rows: Ints, total: int) -> Ints:
-    """Indices of evenly chosen rows of a level, so that all levels have ROWS together."""
-    every = max(1, -(-total // ROWS))
-    return np.arange(0, len(rows), every)
 
 
 def _blank(group: Group, channels: Mapping[str, int], values: Mapping[str, Ints]) -> GroupModel:

@@ -8,7 +8,7 @@ integers.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +25,7 @@ CLASSES = HIGH_CLASS - LOW_CLASS + 1
 UNIT = 32  # an input of 32 is one standard deviation, or "yes"
 MOST_FACTOR, MOST_OFFSET, MOST_BIAS, MOST_SHIFT = 1 << 20, 1 << 28, 1 << 28, 24
 CLASS, FEATURE, SCALING, EXTRA, SLOTS, OFFSETS = "class", "feature", "scaling", "extra", "slots", "offsets"
+ORDER = (CLASS, FEATURE, SCALING, EXTRA, SLOTS, OFFSETS)
 
 
 @dataclass(frozen=True)
@@ -94,22 +95,23 @@ def inputs_of(group: Group, channels: Mapping[str, int]) -> list[int]:
 class Walk:
     """Codes the values of all groups, level by level. One walk writes, another one reads the same.
 
-    values: by group, [C, N] int32 in coding order. Readers begin with zeros.
+    values: by group, [C, N] int32 in coding order. Readers begin with zeros. columns: the same as
+    inputs, int16.
     """
 
     def __init__(self, groups: Sequence[Group], order: CodingOrder, models: Mapping[str, GroupModel], slow: bool = False) -> None:
         self.groups, self.order, self.models, self.slow = groups, order, models, slow
-        self.count = sum(map(len, order.rows))
+        self.count = len(order.rows)
         self.values = {g.name: np.zeros((g.channels, self.count), np.int32) for g in groups}
-        self._columns = {g.name: np.zeros((g.channels, self.count), np.int16) for g in groups}
+        self.columns = {g.name: np.zeros((g.channels, self.count), np.int16) for g in groups}
+        self._needed = {name for g in groups for name in g.own} | {g.name for g in groups if g.is_chain or g.from_parents}
 
     def write(self, values: Mapping[str, Ints]) -> dict[str, SymbolWriter]:
         """The streams by group of values by group."""
         self.values = {name: np.ascontiguousarray(value, np.int32) for name, value in values.items()}
         out = {group.name: SymbolWriter(self.slow) for group in self.groups}
 
-        def code(group: Group, channel: int, rows: Ints, mean: Ints, scale: Ints) -> Ints:
-            found = self.values[group.name][channel, rows]
+        def code(group: Group, found: Ints, mean: Ints, scale: Ints) -> Ints:
             if group.is_binary:
                 out[group.name].bits(found.astype(np.uint8), scale)
             else:
@@ -123,12 +125,11 @@ class Walk:
         """The values by group of streams by group. Raises Damaged for streams that do not fit."""
         readers = {group.name: SymbolReader(streams[group.name], self.slow) for group in self.groups}
 
-        def code(group: Group, channel: int, rows: Ints, mean: Ints, scale: Ints) -> Ints:
+        def code(group: Group, found: Ints, mean: Ints, scale: Ints) -> Ints:
             reader = readers[group.name]
             found = reader.bits(scale).astype(np.int32) if group.is_binary else reader.symbols(mean, scale)
             if group.name == CLASS and len(found) and not LOW_CLASS <= found.min() <= found.max() <= HIGH_CLASS:
                 raise Damaged("a step class out of range")
-            self.values[group.name][channel, rows] = found
             return found
 
         self._run(code)
@@ -136,41 +137,47 @@ class Walk:
             reader.finish()
         return self.values
 
-    def _run(self, code) -> None:  # type: ignore[no-untyped-def]
-        for level, rows in enumerate(self.order.rows):
-            for group in self.groups if len(rows) else ():
-                self._run_group(group, level, rows, code)
+    def _run(self, code: Callable[[Group, Ints, Ints, Ints], Ints]) -> None:
+        """code(group, values, mean, scale) writes values, or reads and returns them."""
+        for level, places in enumerate(self.order.levels):
+            for group in self.groups if places.stop > places.start else ():
+                self._run_group(group, level, places, code)
 
-    def _run_group(self, group: Group, level: int, rows: Ints, code) -> None:  # type: ignore[no-untyped-def]
-        model, classes = self.models[group.name], self._classes(group, rows)
-        inputs, used = self.inputs(group, level, rows, classes)
+    def _run_group(self, group: Group, level: int, places: slice, code: Callable[[Group, Ints, Ints, Ints], Ints]) -> None:
+        model, classes = self.models[group.name], self.classes(group, places)
+        inputs, used = self.inputs(group, level, places)
         for c in range(group.channels):
             mean, scale = predict(inputs, used, model.weights[c], model.numbers[c].tolist(), classes, self.slow)
+            values = self.values[group.name][c, places]
             if group.masked:
-                live = self.values[SLOTS][c // group.masked, rows] != 0
-                found = np.zeros(len(rows), np.int32)
-                found[live] = code(group, c, rows[live], mean[live], scale[live])
+                live = self.values[SLOTS][c // group.masked, places] != 0
+                values[live] = code(group, values[live], mean[live], scale[live])
             else:
-                found = code(group, c, rows, mean, scale)
-            column = as_inputs(found, classes, *self.models[group.name].scaling[c].tolist(), slow=self.slow)
-            self._columns[group.name][c, rows] = column
-            if group.is_chain:
-                inputs[used] = column
-                used += 1
+                values[:] = code(group, values, mean, scale)
+            if group.name in self._needed:
+                column = as_inputs(values, classes, *model.scaling[c].tolist(), slow=self.slow)
+                self.columns[group.name][c, places] = column
+                if group.is_chain:
+                    inputs[used] = column
+                    used += 1
 
-    def _classes(self, group: Group, rows: Ints) -> NDArray[np.int8]:
-        return self.values[CLASS][0, rows].astype(np.int8) if group.has_steps else np.zeros(len(rows), np.int8)
+    def classes(self, group: Group, places: slice) -> NDArray[np.int8]:
+        """The step classes [n] that scale a group's steps at places of the coding order."""
+        found = self.values[CLASS][0, places]
+        return found.astype(np.int8) if group.has_steps else np.zeros(len(found), np.int8)
 
-    def inputs(self, group: Group, level: int, rows: Ints, classes: NDArray[np.int8]) -> tuple[NDArray[np.int16], int]:
-        """The inputs [D, n] of a group's last channel at the rows of a level, and how many of them
+    def inputs(self, group: Group, level: int, places: slice) -> tuple[NDArray[np.int16], int]:
+        """The inputs [D, n] of a group's last channel at the places of a level, and how many of them
         the first channel has; the rest is empty yet."""
-        fixed = [np.repeat((np.arange(LEVELS) == level)[:, None], len(rows), 1) * UNIT]
+        n = places.stop - places.start
+        columns = [self.columns[name][:, places] for name in group.own]
+        columns += [blend(self.columns[group.name], *self.order.parents[level], slow=self.slow)] if group.from_parents else []
+        known = LEVELS + (CLASSES if group.has_steps else 0)
+        used = known + sum(map(len, columns))
+        out = np.empty((used + (group.channels if group.is_chain else 0), n), np.int16)
+        out[:LEVELS] = (np.arange(LEVELS)[:, None] == level) * UNIT
         if group.has_steps:
-            fixed.append((np.arange(LOW_CLASS, HIGH_CLASS + 1)[:, None] == classes) * UNIT)
-        fixed += [self._columns[name][:, rows] for name in group.own]
-        if group.from_parents:
-            fixed.append(blend(self._columns[group.name], *self.order.parents[level], slow=self.slow))
-        used = sum(map(len, fixed))
-        out = np.empty((used + (group.channels if group.is_chain else 0), len(rows)), np.int16)
-        np.concatenate(fixed, out=out[:used], casting="unsafe")
+            out[LEVELS:known] = (np.arange(LOW_CLASS, HIGH_CLASS + 1, dtype=np.int8)[:, None] == self.classes(group, places)) * np.int16(UNIT)
+        if columns:
+            np.concatenate(columns, out=out[known:used])
         return out, used

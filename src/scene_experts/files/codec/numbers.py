@@ -78,15 +78,14 @@ def _code_model(code: Coding, group: Group, inputs: list[int], model: GroupModel
     shifts = [_differences(code, known[i], C, -24, 24) for i in (1, 3)]
     scaling = [_code_coarse(code, known[i], C) for i in (4, 5)]
     numbers = np.stack([biases[0], shifts[0], biases[1], shifts[1]], 1)
-    weights = []
     scales = None if model is None else np.array([[scale_of(row) for row in rows] for rows in model.weights], np.int32)
     scale = np.stack([_differences(code, None if scales is None else scales[:, i], C, 0, TOP) for i in (0, 1)], 1)
-    for c, D in enumerate(inputs):
-        flat = None if model is None else model.weights[c].ravel().astype(np.int32)
-        found = code(flat, 2 * D, np.repeat(scale[c], D).astype(np.int32))
-        if np.abs(found.astype(np.int64)).max(initial=0) > 127:
-            raise Damaged("a weight out of range")
-        weights.append(found.astype(np.int8).reshape(2, D))
+    flat = None if model is None else np.concatenate([rows.ravel() for rows in model.weights]).astype(np.int32)
+    found = code(flat, 2 * sum(inputs), np.repeat(scale.ravel(), np.repeat(inputs, 2)).astype(np.int32))
+    if np.abs(found.astype(np.int64)).max(initial=0) > 127:
+        raise Damaged("a weight out of range")
+    ends = np.cumsum(2 * np.array(inputs))
+    weights = [found[end - 2 * D : end].astype(np.int8).reshape(2, D) for end, D in zip(ends, inputs)]
     return GroupModel(weights, numbers, np.stack(scaling, 1)).checked()
 
 

@@ -21,7 +21,7 @@ _MOST_OPERATIONS = 6  # of a symbol
 
 def _at(array: NDArray[Any]) -> int:
     assert array.flags.c_contiguous
-    return array.ctypes.data
+    return array.__array_interface__["data"][0]  # ten times as fast as array.ctypes.data
 
 
 class SymbolWriter:
@@ -58,14 +58,14 @@ class SymbolWriter:
             self._parts.append(reference.code_cells(keys, depth))
             return
         keys = np.ascontiguousarray(keys, np.int64)
-        room = np.empty(0, np.uint32)
-        for _ in range(2):  # the first call counts
+        room = np.empty(48 * len(keys) + 64, np.uint32)
+        for _ in range(2):  # few scenes need more room
             used = self._library.se_code_cells(_at(keys), len(keys), depth, _at(room), len(room))
             native.check(int(used < 0), "coding the positions")
             if used <= len(room):
                 break
             room = np.empty(used, np.uint32)
-        self._parts.append(room)
+        self._parts.append(room[:used].copy())
 
     @property
     def ideal_bits(self) -> float:
