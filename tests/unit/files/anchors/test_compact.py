@@ -12,52 +12,14 @@ from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.files.anchors import compact
 from scene_experts.files.anchors.compact import encode, read
-from scene_experts.files.anchors.data import AnchorData, by_file_name
-from scene_experts.files.anchors.precision import Precision, from_spread
 from scene_experts.files.codec import container, fit
+from support.compact import ABOUT, ORIGIN, K, make_scene
 from support.messages import naming
-
-K, F = 4, 6
-OUT = {"opacity": K, "cov": 7 * K, "color": 3 * K}
-ORIGIN = (-1.5, 20.25, 0.1 + 0.2)
-ABOUT = {"recipe": "moe-gs", "step": 7, "add_dist": {"opacity": False, "cov": True, "color": False}, "world": {"scale": 40.0}}
-
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     """Models need not be good here."""
     monkeypatch.setattr(fit, "STEPS", 4)
-
-
-def networks(E=3):
-    g = torch.Generator().manual_seed(1)
-    new = lambda *shape: torch.randn(*shape, generator=g)  # noqa: E731
-    shared = {a: new(8, F + 3 + (a == "cov")) for a in OUT}
-    shared["cov"][:, -1] *= 40  # the distance, in another unit than that of the training
-    return by_file_name(
-        {
-            a: {"w1": shared[a] + 0.1 * new(E, *shared[a].shape), "b1": new(E, 8), "w2": new(E, n, 8), "b2": new(E, n), "router_w": new(E, F), "router_b": new(E)}
-            for a, n in OUT.items()
-        }
-    )
-
-
-def scene(n=300, seed=0, spread=40, **columns):
-    """Anchors on a sphere of cells; each row's first feature is its number."""
-    g = torch.Generator().manual_seed(seed)
-    direction = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1)
-    feature = torch.randn(n, F, generator=g) * 2
-    feature[:, 0] = torch.arange(n)
-    found = {"feature": feature, "log_scaling": torch.randn(n, 6, generator=g) - 5, "offsets": torch.randn(n, K, 3, generator=g) ** 3}
-    data = AnchorData({"xyz": torch.zeros(n, 3), **found, **columns}, networks(), ABOUT, (direction * spread).round().long(), 0.0013, ORIGIN, ("cov",))
-    return replace(data, precision=with_number(data))
-
-
-def with_number(data):
-    """A precision with classes of all sizes, in which the first feature is exact."""
-    p = from_spread(data.columns, data.networks)
-    classes = torch.arange(len(data.columns["xyz"])) % 7 - 2
-    return Precision({**p.steps, "feature": torch.cat([torch.tensor([1 / 16]), p.steps["feature"][1:]])}, classes, p.networks)
 
 
 def back(path, data):
@@ -68,7 +30,7 @@ def back(path, data):
 
 
 def test_a_scene_comes_back(tmp_path):
-    data = scene()
+    data = make_scene()
     found, order = back(tmp_path / "c", data)
     assert sorted(order.tolist()) == list(range(300)) and torch.equal(found.cells, data.cells[order])
     assert torch.equal(found.columns["xyz"], (found.cells.double() * 0.0013 + torch.tensor(ORIGIN, dtype=torch.float64)).float())
@@ -85,10 +47,10 @@ def test_a_scene_comes_back(tmp_path):
 
 def test_the_same_bytes_on_every_run_and_number_of_threads():
     before = torch.get_num_threads()
-    first = encode(scene())[0]
+    first = encode(make_scene())[0]
     torch.set_num_threads(3)
     try:
-        assert encode(scene())[0] == first
+        assert encode(make_scene())[0] == first
     finally:
         torch.set_num_threads(before)
 
@@ -96,7 +58,7 @@ def test_the_same_bytes_on_every_run_and_number_of_threads():
 def test_masked_slots_take_no_room_and_intervals_come_back(tmp_path):
     slots = torch.rand(300, K, generator=torch.Generator().manual_seed(2)) < 0.4
     intervals = torch.rand(300, generator=torch.Generator().manual_seed(3)) + 0.01
-    whole, masked = scene(), scene(slots=slots, interval=intervals)
+    whole, masked = make_scene(), make_scene(slots=slots, interval=intervals)
     assert encode(masked)[1].parts["offsets"] < 0.5 * encode(whole)[1].parts["offsets"]
     found, order = back(tmp_path / "b", masked)
     assert torch.equal(found.columns["slots"], slots[order]) and not found.columns["offsets"][~slots[order]].any()
@@ -105,25 +67,24 @@ def test_masked_slots_take_no_room_and_intervals_come_back(tmp_path):
 
 def test_levels_of_detail(tmp_path):
     level, extra = torch.arange(300) % 3, torch.rand(300, generator=torch.Generator().manual_seed(4))
-    data = scene(level=level, extra_level=extra)
-    data = replace(data, cells=data.cells // (2 ** (2 - level))[:, None], voxel=0.5, edges=(2.0, 1.0, 0.5))
+    data = make_scene(level=level, extra_level=extra)
     found, order = back(tmp_path / "c", data)
-    assert torch.equal(found.columns["level"], level[order]) and found.voxel == 0.5
+    assert torch.equal(found.columns["level"], level[order]) and found.voxel == 0.0013
     torch.testing.assert_close(found.columns["extra_level"], extra[order], rtol=0, atol=0.0041)
     wanted = data.cells.double() * torch.tensor(data.edges, dtype=torch.float64)[level][:, None] + torch.tensor(ORIGIN, dtype=torch.float64)
     assert torch.equal(found.columns["xyz"], wanted.float()[order])
     with pytest.raises(InputError, match="--format anchors"):
-        encode(replace(data, edges=(2.0, 0.7, 0.5)))
+        encode(replace(data, edges=(0.0052, 0.003, 0.0013)))
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 9])
 def test_few_anchors(tmp_path, n):
-    found, order = back(tmp_path / "c", scene(n))
+    found, order = back(tmp_path / "c", make_scene(n))
     assert len(found.columns["xyz"]) == n == len(set(order.tolist()))
 
 
 def test_several_anchors_in_a_cell_far_cells_and_wide_scenes(tmp_path):
-    data = scene(5)
+    data = make_scene(5)
     for base in (-(2**50), 2**50):
         cells = torch.tensor([[base, -base, 0], [base + 2**21 - 1, -base, 5], [base, -base, 0], [base, -base, 0], [base + 1, -base, 0]])
         found, order = back(tmp_path / "c", replace(data, cells=cells))
@@ -135,7 +96,7 @@ def test_several_anchors_in_a_cell_far_cells_and_wide_scenes(tmp_path):
 
 
 def test_constant_channels_and_huge_values(tmp_path):
-    data = scene(20)
+    data = make_scene(20)
     data.columns["offsets"].zero_()
     data.columns["feature"][3, 2] = 1e6
     found, order = back(tmp_path / "c", replace(data, precision=replace(data.precision, classes=torch.zeros(20, dtype=torch.long))))
@@ -147,18 +108,18 @@ def test_constant_channels_and_huge_values(tmp_path):
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_values_that_are_not_finite(bad):
-    data = scene(10)
+    data = make_scene(10)
     data.columns["feature"][3, 2] = bad
     with pytest.raises(InputError, match=naming("feature", 1)):
         encode(data)
-    data = scene(10)
+    data = make_scene(10)
     data.networks["cov.experts.w1"][0, 0, 0] = bad
     with pytest.raises(InputError, match=naming("cov.experts.w1")):
         encode(data)
 
 
 def test_sizes_add_up_and_are_told():
-    data, sizes = encode(scene())
+    data, sizes = encode(make_scene())
     header = int.from_bytes(data[8:12], "little")
     assert sizes.total == len(data) == sum(sizes.parts.values()) + header + 16 and sizes.anchors == 300
     assert all(word in str(sizes) for word in ("positions", "features", "networks", "context models", "header", "bytes per anchor"))
@@ -168,7 +129,7 @@ def test_truncated_damaged_and_other_files(tmp_path):
     path = tmp_path / "c"
     with pytest.raises(InputError, match=naming(path)):
         read(path)
-    data = encode(scene(50))[0]
+    data = encode(make_scene(50))[0]
     rng = np.random.default_rng(0)
     broken = [data[:cut] for cut in (0, 5, 8, 11, 500, len(data) - 1)] + [data + b"x"]
     for place in rng.integers(0, len(data), 20):
@@ -200,13 +161,13 @@ def change(data, changes, parts=None):
     ],
 )
 def test_a_header_that_does_not_fit_its_contents(tmp_path, changes):
-    (tmp_path / "c").write_bytes(change(encode(scene(50))[0], changes))
+    (tmp_path / "c").write_bytes(change(encode(make_scene(50))[0], changes))
     with pytest.raises(InputError, match=naming(tmp_path)):
         read(tmp_path / "c")
 
 
 def test_streams_of_something_else(tmp_path):
-    data = encode(scene(50))[0]
+    data = encode(make_scene(50))[0]
     for name, part in container.part(data)[1].items():
         for other in (b"", part[:-2], part + b"\0\0", bytes(len(part)), b"\xff" * len(part)):
             (tmp_path / "c").write_bytes(change(data, {}, {name: other}))
@@ -216,7 +177,7 @@ def test_streams_of_something_else(tmp_path):
 
 
 def test_a_small_file_cannot_claim_much_memory(tmp_path):
-    data = encode(scene(50))[0]
+    data = encode(make_scene(50))[0]
     (tmp_path / "c").write_bytes(change(data, {"N": 1 << 28, "lattices": [[0, 1.0, 1, [0, 0, 0], 1 << 28, 1 << 28, 20]]}))
     with pytest.raises(InputError, match=naming(tmp_path)):
         read(tmp_path / "c")
@@ -230,9 +191,9 @@ def test_a_small_file_cannot_claim_much_memory(tmp_path):
 def test_a_full_disk(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(RunError, match=naming(tmp_path)):
-        compact.write(tmp_path / "file" / "c", scene(5), {})
+        compact.write(tmp_path / "file" / "c", make_scene(5), {})
 
 
 def test_scenes_that_the_format_cannot_hold():
     with pytest.raises(InputError, match="--format anchors"):
-        encode(replace(scene(5), cells=None))
+        encode(replace(make_scene(5), cells=None))
