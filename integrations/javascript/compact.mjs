@@ -401,20 +401,21 @@ export async function readCompact(bytes) {
   const values = readGroups(groups, models, readers, rows.length, ends, findParents(along, curve, level));
 
   const networks = {}, exact = {}, weights = new Reader(parts.networks);
-  let from = parts.exact.byteOffset - bytes.byteOffset;
+  const floats = await inflate(parts.exact), numbers = new DataView(floats.buffer);
+  let from = 0;
   header.networks.forEach(([name, shape], i) => {
     if (i < header.rounded) return void (networks[name] = readNetwork(weights, name, shape));
     const size = shape.reduce((a, b) => a * b, 1);
-    exact[name] = { shape, values: Float32Array.from({ length: size }, (_, k) => view.getFloat32(from + 4 * k, true)) };
+    exact[name] = { shape, values: Float32Array.from({ length: size }, (_, k) => numbers.getFloat32(from + 4 * k, true)) };
     from += 4 * size;
   });
   weights.finish();
 
   let checksum = crc32(littleEndian(rows.flatMap((row) => along[row])));
   for (const g of groups) for (const channel of values[g.name]) checksum = crc32(littleEndian(channel), checksum);
-  for (const { values: numbers, exponents } of Object.values(networks))
-    checksum = crc32(littleEndian(exponents), crc32(littleEndian(numbers), checksum));
-  checksum = crc32(parts.exact, checksum);
+  for (const { values: whole, exponents } of Object.values(networks))
+    checksum = crc32(littleEndian(exponents), crc32(littleEndian(whole), checksum));
+  checksum = crc32(floats, checksum);
   if (checksum !== header.integers) fail("numbers with another checksum");
   const cells = rows.map((row) => places[row].own), lattice = rows.map((row) => places[row].lattice);
   return { header, cells, lattice, groups: values, networks, exact, checksum };

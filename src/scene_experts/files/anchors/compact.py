@@ -8,6 +8,7 @@ pictures.
 
 from __future__ import annotations
 
+import math
 import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -44,7 +45,14 @@ VERSION = 2
 MOST_ANCHORS, MOST_CHANNELS, MOST_SLOTS = 1 << 28, 1024, 256  # of a file; F and K
 MOST_TENSORS, MOST_VALUES = 1000, 1 << 28
 POSITIONS, MODELS, NETWORKS, EXACT = "positions", "models", "networks", "exact"  # names of parts, beside those of the groups
-_LABELS = {"class": "classes", "feature": "features", "scaling": "scalings", "slots": "masks", "models": "context models", "exact": "routers"}
+_LABELS = {
+    "class": "classes",
+    "feature": "features",
+    "scaling": "scalings",
+    "slots": "masks",
+    "models": "context models",
+    "exact": "routers",
+}
 
 
 @dataclass(frozen=True)
@@ -99,7 +107,7 @@ def encode(data: AnchorData) -> tuple[bytes, Sizes]:
         code_rounded(writing(weights), (len(rounded.values), *rounded.values.shape[1:]), rounded)
     parts = {POSITIONS: cells.pack(), MODELS: numbers.pack()}
     parts |= {name: stream.pack() for name, stream in Walk(groups, way, models).write(values).items()}
-    exact = b"".join(value.astype("<f4").tobytes() for value in whole.exact.values())
+    exact = zlib.compress(b"".join(value.astype("<f4").tobytes() for value in whole.exact.values()), 9)
     parts |= {NETWORKS: weights.pack(), EXACT: exact}
     header = {
         "version": VERSION,
@@ -127,7 +135,11 @@ def checksum(places: Places, whole: WholeScene) -> int:
     """CRC-32 of all numbers, 32 bits each, low byte first: fine cells [N, 3], the groups [C, N], values
     [E, R, C] and exponents [R] of each network, then the tensors that are held as they are."""
     found = 0
-    for array in (places.fine, *(whole.values[name] for name in ORDER if name in whole.values), *(a for r in whole.networks.values() for a in (r.values, r.exponents))):
+    for array in (
+        places.fine,
+        *(whole.values[name] for name in ORDER if name in whole.values),
+        *(a for r in whole.networks.values() for a in (r.values, r.exponents)),
+    ):
         found = zlib.crc32(np.ascontiguousarray(array, "<i4").data, found)
     for array in whole.exact.values():
         found = zlib.crc32(np.ascontiguousarray(array, "<f4").data, found)
@@ -155,7 +167,7 @@ def _decode(source: Source) -> AnchorData:
     if any(name not in FURTHER for name in extra) or len(set(extra)) < len(extra):
         raise Damaged("an unknown column")
     shapes = _shapes(header["networks"])
-    source.spend_bytes(8 * sum(int(np.prod(shape)) for shape in shapes.values()))
+    source.spend_bytes(8 * sum(math.prod(shape) for shape in shapes.values()))
     origin = tuple(number(v, "the origin of the cells", -FARTHEST, FARTHEST) for v in header["origin"])
     lattices = [Lattice.from_plain(value, n) for value in header["lattices"][:MOST_LATTICES]]
     if sum(lattice.count for lattice in lattices) != n or len(origin) != 3:
@@ -194,7 +206,7 @@ def _shapes(listed: Any) -> dict[str, tuple[int, ...]]:
     out = {}
     for name, shape in listed[:MOST_TENSORS]:
         out[str(name)] = tuple(whole_number(v, f"the shape of {name}", 1, 1 << 24) for v in shape)
-        if not 1 <= len(shape) <= 3 or np.prod(np.array(out[str(name)], float)) > MOST_VALUES:
+        if not 1 <= len(shape) <= 3 or math.prod(out[str(name)]) > MOST_VALUES:
             raise Damaged(f"a network {name} of another shape")
     if len(out) != len(listed):
         raise Damaged("networks of the same name, or too many")
@@ -212,16 +224,18 @@ def _steps(value: Any, F: int, K: int, extra: list[str]) -> dict[str, list[float
 def _networks(parts: dict[str, bytes], shapes: dict[str, tuple[int, ...]], count: int) -> tuple[dict[str, Rounded], dict[str, Any]]:
     """The networks' tensors as whole numbers, the first `count`, and the others as they are."""
     stream, rounded, exact, at = SymbolReader(parts[NETWORKS]), {}, {}, 0
+    machine = zlib.decompressobj()
+    floats = machine.decompress(parts[EXACT], 4 * sum(math.prod(shape) for shape in list(shapes.values())[count:]) + 1)
     for i, (name, shape) in enumerate(shapes.items()):
         if i < count:
             E, R, C = rows_of(name, torch.empty(shape, device="meta")).shape
             rounded[name] = code_rounded(reading(stream), (E, R, C), None)
         else:
-            size = 4 * int(np.prod(shape))
-            exact[name] = np.frombuffer(parts[EXACT][at : at + size], "<f4").astype(np.float32)
+            size = 4 * math.prod(shape)
+            exact[name] = np.frombuffer(floats[at : at + size], "<f4").astype(np.float32)
             at += size
     stream.finish()
-    if at != len(parts[EXACT]):
+    if at != len(floats) or not machine.eof or machine.unused_data:
         raise Damaged("networks of another size")
     return rounded, exact
 

@@ -103,7 +103,7 @@ def find_places(data: AnchorData) -> tuple[Places, NDArray[np.int64]]:
     multiples = [_multiple(edges[j], edges[held[-1]]) for j in held]
     lattice = np.searchsorted(held, level)
     fine = cells * np.array(multiples or [1])[lattice][:, None]
-    fine, low = _from_zero(fine)
+    fine = _from_zero(fine)
     keys = morton(fine)
     order = np.lexsort((lattice, keys))
     lattices = []
@@ -124,13 +124,13 @@ def _multiple(edge: float, finest: float) -> int:
     return found
 
 
-def _from_zero(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Cells relative to their least coordinates, and those. Raises InputError for a wide scene."""
+def _from_zero(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Cells relative to their least coordinates. Raises InputError for a wide scene."""
     low = cells.min(0) if len(cells) else np.zeros(3, np.int64)
     spread = int((cells.max(0) - low).max()) if len(cells) else 0
     if spread >= 1 << AXIS_BITS:
         raise InputError(f"expected a scene at most {1 << AXIS_BITS:,} voxels wide, found {spread + 1:,}; remove far anchors")
-    return cells - low, low
+    return cells - low
 
 
 def write_places(places: Places, writer: SymbolWriter) -> None:
@@ -162,7 +162,7 @@ def read_places(lattices: list[Lattice], reader: SymbolReader) -> Places:
     reader.finish()
     cells, lattice_of = np.concatenate(own), np.concatenate(index)
     try:
-        keys = morton(_from_zero(np.concatenate(fine))[0])
+        keys = morton(_from_zero(np.concatenate(fine)))
     except InputError as error:
         raise Damaged(str(error)) from None
     order = np.lexsort((lattice_of, keys)) if len(lattices) > 1 else np.arange(len(keys))

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -149,5 +148,3 @@ def rounded(data: AnchorData, precision: Precision) -> AnchorData:
     plain = {name: value for name, value in data.columns.items() if name not in (*ROUNDED, *FURTHER, "slots")}
     shapes = {name: tuple(value.shape) for name, value in data.networks.items()}
     return replace(restore(whole, replace(data, columns=plain), shapes), precision=precision)
-
-

@@ -1,10 +1,10 @@
 """The bytes of a compact file: mark, header, parts, checksum.
 
-    8 bytes    the mark "SXCOMP2" and a line feed
-    4 bytes    length of the header, little endian
-    header     JSON, deflated (zlib); "parts" lists names and lengths of the parts, in order
-    parts
-    4 bytes    CRC-32 of everything before, little endian
+8 bytes    the mark "SXCOMP2" and a line feed
+4 bytes    length of the header, little endian
+header     JSON, deflated (zlib); "parts" lists names and lengths of the parts, in order
+parts
+4 bytes    CRC-32 of everything before, little endian
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import zlib
 from collections.abc import Mapping
 from typing import Any
 
-from scene_experts.core.reading.budget import CutShort, Damaged
 from scene_experts.core.reading.budget import META as HEADER
+from scene_experts.core.reading.budget import CutShort, Damaged
 from scene_experts.core.reading.numbers import whole_number
 from scene_experts.core.reading.plain import parse_json
 

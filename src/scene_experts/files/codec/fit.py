@@ -16,12 +16,13 @@ import torch
 from torch import Tensor
 
 from scene_experts.files.codec.groups import CLASS, MOST_FACTOR, MOST_OFFSET, SLOTS, UNIT, Group, GroupModel, Walk, inputs_of
-from scene_experts.files.codec.order import LEVELS, CodingOrder
+from scene_experts.files.codec.order import CodingOrder
 from scene_experts.files.codec.reference import Ints
 from scene_experts.files.codec.streams import as_inputs
 
 ROWS = 32_768  # anchors that a model is fitted to, at most
 STEPS, BATCH, RATE = 300, 2048, 0.02
+PER_STEP = 4  # anchors for each step, at least: few anchors cannot tell more
 PRICE = 0.5  # bits of a weight that is not zero, for each unit of its size; spread over the anchors
 _MEAN, _SPREAD = 64.0, 6  # units of a weight of the mean; shift of those of the spread
 _OCTAVE = 8 / math.log(2)
@@ -60,7 +61,9 @@ def fit_models(groups: Sequence[Group], order: CodingOrder, values: Mapping[str,
         rows = np.concatenate([np.arange(places.start, places.stop, every) for places in order.levels])
         live = walk.values[SLOTS][:, rows] != 0 if group.masked else None
         with one_thread():
-            models[group.name] = _fit(group, models[group.name], np.concatenate(parts, 1), walk.values[group.name][:, rows], classes[rows], live)
+            models[group.name] = _fit(
+                group, models[group.name], np.concatenate(parts, 1), walk.values[group.name][:, rows], classes[rows], live
+            )
     return models
 
 
@@ -125,20 +128,33 @@ def _fit(group: Group, blank: GroupModel, inputs: np.ndarray, values: Ints, clas
     return _whole(blank, mean * deviation[:, None], bias * deviation + middle, spread, start + deviation.log(), mask)
 
 
-def _descend(X: Tensor, y: Tensor, k: Tensor, seen: Tensor, mask: Tensor, mean: Tensor, bias: Tensor, start: Tensor, middle: Tensor, deviation: Tensor, means: bool):  # type: ignore[no-untyped-def]  # noqa: E501
+def _descend(
+    X: Tensor,
+    y: Tensor,
+    k: Tensor,
+    seen: Tensor,
+    mask: Tensor,
+    mean: Tensor,
+    bias: Tensor,
+    start: Tensor,
+    middle: Tensor,
+    deviation: Tensor,
+    means: bool,
+):  # type: ignore[no-untyped-def]
     """Weights and biases of mean and spread (in deviations and natural logarithms) with the
     shortest code."""
-    n, C = y.shape
+    n = len(y)
     spread = torch.zeros_like(mean)
     parts = [mean, bias, spread, start] if means else [spread, start]
     for part in parts:
         part.requires_grad_()
     optimizer = torch.optim.Adam(parts, lr=RATE)
     generator = torch.Generator().manual_seed(0)
-    for step in range(STEPS):
+    steps = min(STEPS, n // PER_STEP)
+    for step in range(steps):
         rows = torch.randint(0, n, (min(BATCH, n),), generator=generator)
         for entry in optimizer.param_groups:
-            entry["lr"] = RATE * 0.03 ** (step / STEPS)
+            entry["lr"] = RATE * 0.03 ** (step / steps)
         x, own = X[rows], k[rows]
         m = (middle + deviation * (bias + x @ (mean * mask).T)) * 2.0**-own
         log_scale = start + x @ (spread * mask).T + deviation.log() - own * math.log(2)
@@ -159,10 +175,11 @@ def _descend_binary(X: Tensor, y: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]
     bias = torch.log(share / (1 - share)).requires_grad_()
     optimizer = torch.optim.Adam([weights, bias], lr=RATE)
     generator = torch.Generator().manual_seed(0)
-    for step in range(STEPS):
+    steps = min(STEPS, len(y) // PER_STEP)
+    for step in range(steps):
         rows = torch.randint(0, len(y), (min(BATCH, len(y)),), generator=generator)
         for entry in optimizer.param_groups:
-            entry["lr"] = RATE * 0.03 ** (step / STEPS)
+            entry["lr"] = RATE * 0.03 ** (step / steps)
         odds = X[rows] @ (weights * mask).T + bias
         loss = torch.nn.functional.binary_cross_entropy_with_logits(odds, y[rows], reduction="none").sum(1).mean() / math.log(2)
         optimizer.zero_grad()
@@ -181,7 +198,10 @@ def _whole(blank: GroupModel, mean: Tensor, mean_bias: Tensor, spread: Tensor, s
         size = float(mean[c].abs().max())
         precise = math.floor(math.log2(_MEAN / max(float(mean[c].square().sum().sqrt()), 1e-6))) if size > 0 else 0
         for at, (w, b, shift, unit) in enumerate(
-            ((mean[c, :used] * mask[c, :used], mean_bias[c], precise, 32.0), (spread[c, :used] * mask[c, :used], spread_bias[c], _SPREAD, _OCTAVE))
+            (
+                (mean[c, :used] * mask[c, :used], mean_bias[c], precise, 32.0),
+                (spread[c, :used] * mask[c, :used], spread_bias[c], _SPREAD, _OCTAVE),
+            )
         ):
             w = w.double() * unit / UNIT  # outputs per unit of input
             most = float(w.abs().max()) if used else 0.0

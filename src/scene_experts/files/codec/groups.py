@@ -177,7 +177,9 @@ class Walk:
         out = np.empty((used + (group.channels if group.is_chain else 0), n), np.int16)
         out[:LEVELS] = (np.arange(LEVELS)[:, None] == level) * UNIT
         if group.has_steps:
-            out[LEVELS:known] = (np.arange(LOW_CLASS, HIGH_CLASS + 1, dtype=np.int8)[:, None] == self.classes(group, places)) * np.int16(UNIT)
+            out[LEVELS:known] = (np.arange(LOW_CLASS, HIGH_CLASS + 1, dtype=np.int8)[:, None] == self.classes(group, places)) * np.int16(
+                UNIT
+            )
         if columns:
             np.concatenate(columns, out=out[known:used])
         return out, used

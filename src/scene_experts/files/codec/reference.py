@@ -281,9 +281,7 @@ def _shifted(sums: NDArray[np.int64], shift: int) -> NDArray[np.int64]:
     return sums.clip(-(LARGEST >> -shift), LARGEST >> -shift) << -shift
 
 
-def predict(
-    inputs: NDArray[np.int16], weights: NDArray[np.int8], numbers: Sequence[int], classes: NDArray[np.int8]
-) -> tuple[Ints, Ints]:
+def predict(inputs: NDArray[np.int16], weights: NDArray[np.int8], numbers: Sequence[int], classes: NDArray[np.int8]) -> tuple[Ints, Ints]:
     """mean [n] (1/8 of a step) and scale [n] from inputs [D, n], weights [2, D] of both, numbers
     (bias and shift of both) and classes [n]."""
     sums = weights.astype(np.int64) @ inputs.astype(np.int64)

@@ -58,7 +58,7 @@ class SymbolWriter:
             self._parts.append(reference.code_cells(keys, depth))
             return
         keys = np.ascontiguousarray(keys, np.int64)
-        room = np.empty(48 * len(keys) + 64, np.uint32)
+        room, used = np.empty(48 * len(keys) + 64, np.uint32), 0
         for _ in range(2):  # few scenes need more room
             used = self._library.se_code_cells(_at(keys), len(keys), depth, _at(room), len(room))
             native.check(int(used < 0), "coding the positions")
@@ -130,7 +130,11 @@ class SymbolReader:
 
     def finish(self) -> None:
         """Raises Damaged unless the bytes end here."""
-        done = self._slow.is_done if self._slow is not None else self._state.at == len(self._words) and set(self._state.state) == {reference.FLOOR}
+        done = (
+            self._slow.is_done
+            if self._slow is not None
+            else self._state.at == len(self._words) and set(self._state.state) == {reference.FLOOR}
+        )
         if not done:
             raise Damaged("a stream that is longer than its contents")
 

@@ -16,6 +16,7 @@ from scene_experts.files.codec import container, fit
 from support.compact import ABOUT, ORIGIN, K, make_scene
 from support.messages import naming
 
+
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     """Models need not be good here."""
@@ -99,7 +100,7 @@ def test_constant_channels_and_huge_values(tmp_path):
     data = make_scene(20)
     data.columns["offsets"].zero_()
     data.columns["feature"][3, 2] = 1e6
-    found, order = back(tmp_path / "c", replace(data, precision=replace(data.precision, classes=torch.zeros(20, dtype=torch.long))))
+    found, _ = back(tmp_path / "c", replace(data, precision=replace(data.precision, classes=torch.zeros(20, dtype=torch.long))))
     assert not found.columns["offsets"].any() and found.columns["feature"][:, 2].max() == pytest.approx(1e6, rel=1e-4)
     data.columns["feature"][3, 2] = 1e12
     with pytest.raises(InputError, match=naming("feature", "--format anchors")):

@@ -89,7 +89,11 @@ def test_random_words_never_read_outside():
     rng = np.random.default_rng(5)
     for _ in range(100):
         data = rng.integers(0, 256, 64, dtype=np.uint8).tobytes()
-        for use in (lambda r: r.cells(21, 1000), lambda r: r.symbols(np.zeros(200, np.int32), np.full(200, 127, np.int32)), lambda r: r.finish()):
+        for use in (
+            lambda r: r.cells(21, 1000),
+            lambda r: r.symbols(np.zeros(200, np.int32), np.full(200, 127, np.int32)),
+            lambda r: r.finish(),
+        ):
             with pytest.raises(Damaged):
                 use(SymbolReader(data))
 
