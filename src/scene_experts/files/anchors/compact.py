@@ -25,7 +25,7 @@ from scene_experts.core.reading.numbers import FARTHEST, LARGEST, number, whole_
 from scene_experts.core.reading.source import Source, opening
 from scene_experts.data.views import Capture, World
 from scene_experts.files.anchors.data import AnchorData
-from scene_experts.files.anchors.places import MOST_LATTICES, Lattice, Places, find_places, read_places, write_places
+from scene_experts.files.anchors.places import MOST_LATTICES, AnchorPlaces, Lattice, find_places, read_places, write_places
 from scene_experts.files.anchors.precision import rows_of
 from scene_experts.files.anchors.quality import choose_precision
 from scene_experts.files.anchors.rounding import FURTHER, WholeScene, restore, round_scene
@@ -44,6 +44,7 @@ from scene_experts.training.run_folder import OpenRun
 VERSION = 2
 MOST_ANCHORS, MOST_CHANNELS, MOST_SLOTS = 1 << 28, 1024, 256  # of a file; F and K
 MOST_TENSORS, MOST_VALUES = 1000, 1 << 28
+BYTES_PER_VALUE = 16  # in memory, while a file is read
 POSITIONS, MODELS, NETWORKS, EXACT = "positions", "models", "networks", "exact"  # names of parts, beside those of the groups
 _LABELS = {
     "class": "classes",
@@ -131,7 +132,7 @@ def encode(data: AnchorData) -> tuple[bytes, Sizes]:
     return encoded, Sizes(len(encoded), {name: len(part) for name, part in parts.items()}, n)
 
 
-def checksum(places: Places, whole: WholeScene) -> int:
+def checksum(places: AnchorPlaces, whole: WholeScene) -> int:
     """CRC-32 of all numbers, 32 bits each, low byte first: fine cells [N, 3], the groups [C, N], values
     [E, R, C] and exponents [R] of each network, then the tensors that are held as they are."""
     found = 0
@@ -162,7 +163,7 @@ def _decode(source: Source) -> AnchorData:
         raise Damaged(f"version {header['version']!r} of the format, not {VERSION}")
     n = whole_number(header["N"], "the number of anchors", 0, MOST_ANCHORS)
     F, K = whole_number(header["F"], "F", 1, MOST_CHANNELS), whole_number(header["K"], "K", 1, MOST_SLOTS)
-    source.spend_bytes(n * 12 * (3 * K + F + 6 + 12))
+    source.spend_bytes(n * BYTES_PER_VALUE * (3 * K + F + 18))
     extra = [str(name) for name in header["extra"]]
     if any(name not in FURTHER for name in extra) or len(set(extra)) < len(extra):
         raise Damaged("an unknown column")

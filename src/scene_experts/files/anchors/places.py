@@ -61,7 +61,7 @@ class Lattice:
 
 
 @dataclass(frozen=True)
-class Places:
+class AnchorPlaces:
     """Where N anchors are, in coding order, or along the Morton curve."""
 
     lattices: list[Lattice]
@@ -83,16 +83,16 @@ class Places:
         xyz = self.cells * edges[self.lattice][:, None] + np.array(origin)
         return {"xyz": torch.from_numpy(xyz.astype(np.float32))}
 
-    def ordered(self, rows: NDArray[Any]) -> Places:
+    def ordered(self, rows: NDArray[Any]) -> AnchorPlaces:
         """The places of rows [N]."""
-        return Places(self.lattices, self.cells[rows], self.lattice[rows], self.keys[rows])
+        return AnchorPlaces(self.lattices, self.cells[rows], self.lattice[rows], self.keys[rows])
 
     def levels(self) -> Tensor:
         """The level of detail [N] int64 of each anchor."""
         return torch.from_numpy(np.array([lattice.level for lattice in self.lattices] or [0])[self.lattice])
 
 
-def find_places(data: AnchorData) -> tuple[Places, NDArray[np.int64]]:
+def find_places(data: AnchorData) -> tuple[AnchorPlaces, NDArray[np.int64]]:
     """Where the anchors of a scene are, and the order [N] of its rows. Raises InputError for anchors
     on no lattice and for cells that span too much."""
     if data.cells is None:
@@ -114,7 +114,7 @@ def find_places(data: AnchorData) -> tuple[Places, NDArray[np.int64]]:
         x, y, z = corner.tolist()
         distinct = len(np.unique(keys[lattice == i]))
         lattices.append(Lattice(j, float(edges[j]), multiples[i], (x, y, z), len(own), distinct, depth))
-    return Places(lattices, cells[order], lattice[order], keys[order]), order
+    return AnchorPlaces(lattices, cells[order], lattice[order], keys[order]), order
 
 
 def _multiple(edge: float, finest: float) -> int:
@@ -133,7 +133,7 @@ def _from_zero(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     return cells - low
 
 
-def write_places(places: Places, writer: SymbolWriter) -> None:
+def write_places(places: AnchorPlaces, writer: SymbolWriter) -> None:
     """Append the cells of all lattices."""
     for i, lattice in enumerate(places.lattices):
         keys = morton(places.cells[places.lattice == i] - np.array(lattice.low))
@@ -143,7 +143,7 @@ def write_places(places: Places, writer: SymbolWriter) -> None:
             writer.symbols((counts - 1).astype(np.int32), np.zeros(len(counts), np.int32), np.full(len(counts), STEP, np.int32))
 
 
-def read_places(lattices: list[Lattice], reader: SymbolReader) -> Places:
+def read_places(lattices: list[Lattice], reader: SymbolReader) -> AnchorPlaces:
     """The places that `write_places` wrote. Raises Damaged for cells that do not fit."""
     own, index, fine = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)], [np.zeros((0, 3), np.int64)]
     for i, lattice in enumerate(lattices):
@@ -166,4 +166,4 @@ def read_places(lattices: list[Lattice], reader: SymbolReader) -> Places:
     except InputError as error:
         raise Damaged(str(error)) from None
     order = np.lexsort((lattice_of, keys)) if len(lattices) > 1 else np.arange(len(keys))
-    return Places(lattices, cells[order], lattice_of[order], keys[order])
+    return AnchorPlaces(lattices, cells[order], lattice_of[order], keys[order])

@@ -13,9 +13,10 @@ from contextlib import contextmanager
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from scene_experts.files.codec.groups import CLASS, MOST_FACTOR, MOST_OFFSET, SLOTS, UNIT, Group, GroupModel, Walk, inputs_of
+from scene_experts.files.codec.groups import CLASS, MOST_FACTOR, MOST_OFFSET, SLOTS, UNIT, ChannelGroup, GroupModel, Walk, inputs_of
 from scene_experts.files.codec.order import CodingOrder
 from scene_experts.files.codec.reference import Ints
 from scene_experts.files.codec.streams import as_inputs
@@ -23,7 +24,7 @@ from scene_experts.files.codec.streams import as_inputs
 ROWS = 32_768  # anchors that a model is fitted to, at most
 STEPS, BATCH, RATE = 300, 2048, 0.02
 PER_STEP = 4  # anchors for each step, at least: few anchors cannot tell more
-PRICE = 0.5  # bits of a weight that is not zero, for each unit of its size; spread over the anchors
+PRICE = 8.0  # bits, of each unit of the size of a weight (in deviations); spread over the anchors
 _MEAN, _SPREAD = 64.0, 6  # units of a weight of the mean; shift of those of the spread
 _OCTAVE = 8 / math.log(2)
 
@@ -39,7 +40,7 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def fit_models(groups: Sequence[Group], order: CodingOrder, values: Mapping[str, Ints]) -> dict[str, GroupModel]:
+def fit_models(groups: Sequence[ChannelGroup], order: CodingOrder, values: Mapping[str, Ints]) -> dict[str, GroupModel]:
     """Models by group of values by group, [C, N] int32 in coding order."""
     channels = {g.name: g.channels for g in groups}
     models = {g.name: _blank(g, channels, values) for g in groups}
@@ -48,7 +49,7 @@ def fit_models(groups: Sequence[Group], order: CodingOrder, values: Mapping[str,
     every = max(1, -(-walk.count // ROWS))
     for group in groups:
         classes = walk.classes(group, slice(0, walk.count))
-        for c in range(group.channels):
+        for c in range(len(walk.columns[group.name])):
             walk.columns[group.name][c] = as_inputs(walk.values[group.name][c], classes, *models[group.name].scaling[c].tolist())
         if not walk.count:
             continue
@@ -67,7 +68,7 @@ def fit_models(groups: Sequence[Group], order: CodingOrder, values: Mapping[str,
     return models
 
 
-def _blank(group: Group, channels: Mapping[str, int], values: Mapping[str, Ints]) -> GroupModel:
+def _blank(group: ChannelGroup, channels: Mapping[str, int], values: Mapping[str, Ints]) -> GroupModel:
     """A model that predicts the same of every anchor, with the scaling of its values as inputs."""
     value = values[group.name].astype(np.float64)
     if group.has_steps:
@@ -95,7 +96,14 @@ def _coarse(value: float, low: int, high: int) -> int:
     return min(max(mantissa << exponent if mantissa >= 0 else -(-mantissa << exponent), low), high)
 
 
-def _fit(group: Group, blank: GroupModel, inputs: np.ndarray, values: Ints, classes: np.ndarray, live: np.ndarray | None) -> GroupModel:
+def _fit(
+    group: ChannelGroup,
+    blank: GroupModel,
+    inputs: NDArray[np.int16],
+    values: Ints,
+    classes: NDArray[np.int8],
+    live: NDArray[np.bool_] | None,
+) -> GroupModel:
     """The model of one group. inputs [D, n] of the last channel (and the group's own), values [C,
     n], classes [n], live [slots, n]."""
     X = torch.from_numpy(inputs.T.astype(np.float32) / UNIT)
@@ -121,7 +129,7 @@ def _fit(group: Group, blank: GroupModel, inputs: np.ndarray, values: Ints, clas
         found = torch.linalg.solve(A.T @ A + ridge, A.T @ target)[:, 0].float()
         mean[c, :used], bias[c] = found[:-1], found[-1]
     if not group.from_parents and not group.is_chain:
-        mean.zero_(), bias.zero_()  # type: ignore[unused-ignore]
+        mean, bias = torch.zeros_like(mean), torch.zeros_like(bias)
     left = ((base - middle) / deviation - X @ mean.T - bias).abs()
     start = torch.log(0.7 * (left * seen).sum(0) / seen.sum(0).clamp_min(1) + 1e-3)
     mean, bias, spread, start = _descend(X, y, k, seen, mask, mean, bias, start, middle, deviation, group.from_parents or group.is_chain)
@@ -140,7 +148,7 @@ def _descend(
     middle: Tensor,
     deviation: Tensor,
     means: bool,
-):  # type: ignore[no-untyped-def]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Weights and biases of mean and spread (in deviations and natural logarithms) with the
     shortest code."""
     n = len(y)
@@ -161,11 +169,11 @@ def _descend(
         away, s = -(y[rows] - m).abs(), torch.exp(-log_scale)
         share = torch.sigmoid((away + 0.5) * s) - torch.sigmoid((away - 0.5) * s)
         bits = -torch.log2(share * (1 - 2e-4) + 1e-5) * seen[rows]
-        price = PRICE / n * 16 * (mean.abs().sum() + spread.abs().sum())
+        price = PRICE / n * (mean.abs().sum() + spread.abs().sum())
         optimizer.zero_grad()
         (bits.sum(1).mean() + price).backward()
         optimizer.step()
-    return tuple(part.detach() for part in (mean, bias, spread, start))
+    return mean.detach(), bias.detach(), spread.detach(), start.detach()
 
 
 def _descend_binary(X: Tensor, y: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -183,7 +191,7 @@ def _descend_binary(X: Tensor, y: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]
         odds = X[rows] @ (weights * mask).T + bias
         loss = torch.nn.functional.binary_cross_entropy_with_logits(odds, y[rows], reduction="none").sum(1).mean() / math.log(2)
         optimizer.zero_grad()
-        (loss + PRICE / len(y) * 16 * weights.abs().sum()).backward()
+        (loss + PRICE / len(y) * weights.abs().sum()).backward()
         optimizer.step()
     return weights.detach(), bias.detach()
 

@@ -29,7 +29,7 @@ ORDER = (CLASS, FEATURE, SCALING, EXTRA, SLOTS, OFFSETS)
 
 
 @dataclass(frozen=True)
-class Group:
+class ChannelGroup:
     """Channels that are coded one after the other."""
 
     name: str
@@ -46,18 +46,18 @@ class Group:
     """Channels of each slot, if those of masked slots are left out; 0: none are."""
 
 
-def anchor_groups(F: int, K: int, has_slots: bool = False, extra: int = 0) -> tuple[Group, ...]:
+def anchor_groups(F: int, K: int, has_slots: bool = False, extra: int = 0) -> tuple[ChannelGroup, ...]:
     """The groups of anchors with F features, six lengths, `extra` further columns and K
     Gaussians."""
-    slots = (Group(SLOTS, K, (FEATURE,), is_binary=True, has_steps=False),) if has_slots else ()
-    others = (Group(EXTRA, extra, (SCALING,), has_steps=False),) if extra else ()
+    slots = (ChannelGroup(SLOTS, K, (FEATURE,), is_binary=True, has_steps=False),) if has_slots else ()
+    others = (ChannelGroup(EXTRA, extra, (SCALING,), has_steps=False),) if extra else ()
     return (
-        Group(CLASS, 1, has_steps=False),
-        Group(FEATURE, F),
-        Group(SCALING, 6, (FEATURE,)),
+        ChannelGroup(CLASS, 1, has_steps=False),
+        ChannelGroup(FEATURE, F),
+        ChannelGroup(SCALING, 6, (FEATURE,)),
         *others,
         *slots,
-        Group(OFFSETS, 3 * K, (FEATURE, SCALING), from_parents=False, is_chain=False, masked=3 if has_slots else 0),
+        ChannelGroup(OFFSETS, 3 * K, (FEATURE, SCALING), from_parents=False, is_chain=False, masked=3 if has_slots else 0),
     )
 
 
@@ -82,7 +82,7 @@ class GroupModel:
         return self
 
 
-def inputs_of(group: Group, channels: Mapping[str, int]) -> list[int]:
+def inputs_of(group: ChannelGroup, channels: Mapping[str, int]) -> list[int]:
     """How many inputs each channel of a group has. channels: of the groups by name."""
     fixed = LEVELS + (CLASSES if group.has_steps else 0) + sum(channels[name] for name in group.own)
     fixed += group.channels if group.from_parents else 0
@@ -99,19 +99,19 @@ class Walk:
     inputs, int16.
     """
 
-    def __init__(self, groups: Sequence[Group], order: CodingOrder, models: Mapping[str, GroupModel], slow: bool = False) -> None:
+    def __init__(self, groups: Sequence[ChannelGroup], order: CodingOrder, models: Mapping[str, GroupModel], slow: bool = False) -> None:
         self.groups, self.order, self.models, self.slow = groups, order, models, slow
         self.count = len(order.rows)
         self.values = {g.name: np.zeros((g.channels, self.count), np.int32) for g in groups}
-        self.columns = {g.name: np.zeros((g.channels, self.count), np.int16) for g in groups}
         self._needed = {name for g in groups for name in g.own} | {g.name for g in groups if g.is_chain or g.from_parents}
+        self.columns = {g.name: np.zeros((g.channels if g.name in self._needed else 0, self.count), np.int16) for g in groups}
 
     def write(self, values: Mapping[str, Ints]) -> dict[str, SymbolWriter]:
         """The streams by group of values by group."""
         self.values = {name: np.ascontiguousarray(value, np.int32) for name, value in values.items()}
         out = {group.name: SymbolWriter(self.slow) for group in self.groups}
 
-        def code(group: Group, found: Ints, mean: Ints, scale: Ints) -> Ints:
+        def code(group: ChannelGroup, found: Ints, mean: Ints, scale: Ints) -> Ints:
             if group.is_binary:
                 out[group.name].bits(found.astype(np.uint8), scale)
             else:
@@ -125,7 +125,7 @@ class Walk:
         """The values by group of streams by group. Raises Damaged for streams that do not fit."""
         readers = {group.name: SymbolReader(streams[group.name], self.slow) for group in self.groups}
 
-        def code(group: Group, found: Ints, mean: Ints, scale: Ints) -> Ints:
+        def code(group: ChannelGroup, found: Ints, mean: Ints, scale: Ints) -> Ints:
             reader = readers[group.name]
             found = reader.bits(scale).astype(np.int32) if group.is_binary else reader.symbols(mean, scale)
             if group.name == CLASS and len(found) and not LOW_CLASS <= found.min() <= found.max() <= HIGH_CLASS:
@@ -137,13 +137,13 @@ class Walk:
             reader.finish()
         return self.values
 
-    def _run(self, code: Callable[[Group, Ints, Ints, Ints], Ints]) -> None:
+    def _run(self, code: Callable[[ChannelGroup, Ints, Ints, Ints], Ints]) -> None:
         """code(group, values, mean, scale) writes values, or reads and returns them."""
         for level, places in enumerate(self.order.levels):
             for group in self.groups if places.stop > places.start else ():
                 self._run_group(group, level, places, code)
 
-    def _run_group(self, group: Group, level: int, places: slice, code: Callable[[Group, Ints, Ints, Ints], Ints]) -> None:
+    def _run_group(self, group: ChannelGroup, level: int, places: slice, code: Callable[[ChannelGroup, Ints, Ints, Ints], Ints]) -> None:
         model, classes = self.models[group.name], self.classes(group, places)
         inputs, used = self.inputs(group, level, places)
         for c in range(group.channels):
@@ -161,12 +161,12 @@ class Walk:
                     inputs[used] = column
                     used += 1
 
-    def classes(self, group: Group, places: slice) -> NDArray[np.int8]:
+    def classes(self, group: ChannelGroup, places: slice) -> NDArray[np.int8]:
         """The step classes [n] that scale a group's steps at places of the coding order."""
         found = self.values[CLASS][0, places]
         return found.astype(np.int8) if group.has_steps else np.zeros(len(found), np.int8)
 
-    def inputs(self, group: Group, level: int, places: slice) -> tuple[NDArray[np.int16], int]:
+    def inputs(self, group: ChannelGroup, level: int, places: slice) -> tuple[NDArray[np.int16], int]:
         """The inputs [D, n] of a group's last channel at the places of a level, and how many of them
         the first channel has; the rest is empty yet."""
         n = places.stop - places.start

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.files.codec.fit import split
-from scene_experts.files.codec.groups import Group, GroupModel, inputs_of
+from scene_experts.files.codec.groups import ChannelGroup, GroupModel, inputs_of
 from scene_experts.files.codec.reference import TOP, Ints
 from scene_experts.files.codec.streams import SymbolReader, SymbolWriter
 
@@ -65,13 +65,13 @@ def _differences(code: Coding, values: Ints | None, count: int, low: int, high: 
 # --- models -------------------------------------------------------------------------------------------------------------------------------
 
 
-def code_models(code: Coding, groups: Sequence[Group], models: Mapping[str, GroupModel] | None) -> dict[str, GroupModel]:
+def code_models(code: Coding, groups: Sequence[ChannelGroup], models: Mapping[str, GroupModel] | None) -> dict[str, GroupModel]:
     """Code the models of groups. models: None reads."""
     channels = {g.name: g.channels for g in groups}
     return {g.name: _code_model(code, g, inputs_of(g, channels), None if models is None else models[g.name]) for g in groups}
 
 
-def _code_model(code: Coding, group: Group, inputs: list[int], model: GroupModel | None) -> GroupModel:
+def _code_model(code: Coding, group: ChannelGroup, inputs: list[int], model: GroupModel | None) -> GroupModel:
     C = group.channels
     known = [None] * 6 if model is None else [*model.numbers.T, *model.scaling.T]
     biases = [_code_coarse(code, known[i], C) for i in (0, 2)]
