@@ -112,7 +112,7 @@ def write_compact(path: Path, size: int, allowance: int) -> None:
 
     fit.STEPS, fit.ROWS = 0, 64  # there is nothing to fit
     K, F = 10, 32
-    count = allowance // (compact.BYTES_PER_VALUE * (3 * K + F + 18))
+    count = (allowance - (1 << 20)) // (compact.BYTES_PER_VALUE * (3 * K + F + 18))
     cells = torch.nn.functional.pad(torch.arange(count)[:, None], (0, 2))
     sizes = {"feature": (F,), "offsets": (K, 3), "log_scaling": (6,)}
     columns = {"xyz": cells.float()} | {name: torch.zeros(count, *rest) for name, rest in sizes.items()}

@@ -116,11 +116,13 @@ def restore(whole: WholeScene, data: AnchorData, shapes: Mapping[str, tuple[int,
     """The scene of whole numbers. data: everything else of it; its columns have at least xyz.
     shapes: of the networks' tensors. Raises Damaged for numbers that are no scene."""
     v, n = whole.values, len(data.columns["xyz"])
-    factor = 2.0 ** v[CLASS][0].astype(np.float64)
+    factor = np.float32(2.0) ** v[CLASS][0]
     floats = {}
     for name, steps in whole.steps.items():
-        value = v[name] * np.array(steps, np.float64)[:, None] * (1.0 if name == EXTRA else factor)
-        floats[name] = torch.from_numpy(np.ascontiguousarray(value.T, np.float32))
+        value = v[name].astype(np.float32)
+        value *= np.array(steps, np.float32)[:, None]
+        value *= np.float32(1) if name == EXTRA else factor.astype(np.float32)
+        floats[name] = torch.from_numpy(np.ascontiguousarray(value.T))
     columns = {"feature": floats[FEATURE], "log_scaling": floats[SCALING], "offsets": floats[OFFSETS].reshape(n, len(v[OFFSETS]) // 3, 3)}
     for i, name in enumerate(whole.extra):
         value = floats[EXTRA][:, i].clone()
