@@ -33,6 +33,7 @@ VIEWS = 16  # that judge a precision
 START = -40.0  # first guess of log2 of the mean square error that every value adds
 ROUNDS = 10
 UNKNOWN_ERROR = 10**-3.2  # mean square error of pictures without photographs: that of 32 dB
+WORST_ERROR = 10**-2.6  # of a scene with 26 dB: what a worse one may lose is as if it had these
 MEGABYTE = 1_000_000
 
 
@@ -86,7 +87,7 @@ class Judge:
             image = painter.picture_8bit(self.capture.views[index].camera, background)
             away = float((image - own.float() / 255).double().square().mean())
             after = max(error + away, self._error(index, image) if self.has_photographs else 0.0)
-            total += 10 * math.log10(after / error)
+            total += max(10 * math.log10(after / error), 10 * math.log10(1 + away / WORST_ERROR))
         return total / len(self.views)
 
 
