@@ -12,7 +12,7 @@ from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.files.anchors import compact
 from scene_experts.files.anchors.compact import encode, read
-from scene_experts.files.codec import container, fit
+from scene_experts.files.codec import container, fit, streams
 from support.compact import ABOUT, ORIGIN, K, make_scene
 from support.messages import naming
 
@@ -54,6 +54,15 @@ def test_the_same_bytes_on_every_run_and_number_of_threads():
         assert encode(make_scene())[0] == first
     finally:
         torch.set_num_threads(before)
+
+
+def test_without_the_compiled_library_the_bytes_and_numbers_are_the_same(tmp_path, monkeypatch):
+    data = make_scene(30)
+    wanted, order = back(tmp_path / "c", data)
+    monkeypatch.setattr(streams.native, "load", lambda level=None: None)
+    assert encode(data)[0] == (tmp_path / "c").read_bytes()
+    found = read(tmp_path / "c")
+    assert all(torch.equal(found.columns[name], wanted.columns[name]) for name in wanted.columns) and len(order) == 30
 
 
 def test_masked_slots_take_no_room_and_intervals_come_back(tmp_path):
