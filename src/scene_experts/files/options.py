@@ -20,7 +20,7 @@ class Options:
     """Draw the held-out views from the run and from the file, and say what the file costs in
     PSNR."""
     quality: float = 0.2
-    """compact: dB of PSNR that the training views may lose; held-out views lose about a quarter of it."""
+    """compact: dB of PSNR that the training views may lose; held-out views lose less."""
     target_mb: float = 0.0
     """compact: write a file of at most this many megabytes (10^6 bytes), as good as it can be, in
     place of --quality; 0: any size."""
