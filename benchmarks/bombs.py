@@ -103,24 +103,23 @@ def write_sog(path: Path, size: int, allowance: int) -> None:
 
 
 def write_compact(path: Path, size: int, allowance: int) -> None:
-    """Anchors in a row with equal columns, and a tensor of noise."""
+    """Anchors in a row with equal columns, and a part of noise."""
     import torch
 
-    from scene_experts.core.checkpoint import write_tensors
     from scene_experts.files.anchors import compact
+    from scene_experts.files.anchors.data import AnchorData
+    from scene_experts.files.codec import container, fit
 
+    fit.STEPS, fit.ROWS = 0, 64  # there is nothing to fit
     K, F = 10, 32
-    count = allowance // (8 * (3 * K + F + 6 + 12))
-    squeeze = lambda n: torch.from_numpy(np.frombuffer(zlib.compress(bytes(n), 6), np.uint8).copy())  # noqa: E731
-    cells = torch.from_numpy(np.frombuffer(zlib.compress(b"\x01" * count, 6), np.uint8).copy())
-    blobs = {"cells": cells, "feature": squeeze(2 * F * count), "offsets": squeeze(6 * K * count), "log_scaling": squeeze(12 * count)}
-    blobs |= {"log_scaling.low": torch.zeros(6, dtype=torch.float64), "log_scaling.step": torch.zeros(6, dtype=torch.float64)}
-    networks = {f"network.{a}.experts.w1": torch.randn(1, 32, 35) for a in ("opacity", "cov", "color")}
-    padding = torch.from_numpy(np.frombuffer(noise(size - sum(b.numel() for b in blobs.values())), np.uint8).copy())
-    codes = {"feature": "float16", "offsets": "float16", "log_scaling": "uint16"}
-    about = {"step": 1, "add_dist": {}}
-    meta = {"N": count, "K": K, "F": F, "voxel": 0.01, "origin": [0, 0, 0], "low": [0, 0, 0], "codes": codes, "scene": about}
-    write_tensors(path, blobs | networks | {"padding": padding}, compact.KIND, compact.VERSION, meta)
+    count = (allowance - (1 << 20)) // (compact.BYTES_PER_VALUE * (3 * K + F + 18))
+    cells = torch.nn.functional.pad(torch.arange(count)[:, None], (0, 2))
+    sizes = {"feature": (F,), "offsets": (K, 3), "log_scaling": (6,)}
+    columns = {"xyz": cells.float()} | {name: torch.zeros(count, *rest) for name, rest in sizes.items()}
+    networks = {f"{a}.experts.w1": torch.randn(1, 32, 35) for a in ("opacity", "cov", "color")}
+    data = AnchorData(columns, networks, {"step": 1, "add_dist": {}}, cells, 0.01)
+    header, parts = container.part(compact.encode(data)[0])
+    path.write_bytes(container.join(header, parts | {"padding": noise(size - sum(map(len, parts.values())))}))
 
 
 def write_glb(path: Path, size: int, allowance: int) -> None:

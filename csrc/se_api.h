@@ -5,7 +5,7 @@
 // whose number differs.
 //
 // Arrays are contiguous and row-major. `float` is 32 bits. A pointer may be null only where its comment says so. Functions that return
-// int32_t return 0 on success and 1 when memory runs out. `threads` is the largest number of threads used, including the caller.
+// int32_t return 0 on success and 1 when memory runs out, unless their comment says more. `threads` is the largest number of threads used, including the caller.
 //
 // Symbols: A anchors in view, N rows of a table, K Gaussians per anchor, F feature channels, E experts, k experts per anchor (0: dense),
 // H hidden units, L middle layers, D inputs of the first layer, M Gaussians.
@@ -213,5 +213,44 @@ SE_EXPORT int32_t se_sweep_agree(const SeSweep* call, const int64_t* first, cons
 // which it lies within the share `near_by` of it. Pixels whose inverse depth is 0 say nothing.
 SE_EXPORT int32_t se_sweep_compare(const SeSweep* call, const double* points, int64_t count, double front, double near_by,
                                    int32_t* before, int32_t* on);
+
+// ---- Entropy coder of compact files -----------------------------------------------------------------------------------------------
+// docs/compact-file.md says what is coded. An operation is a share [start, start + width) of 2^15 as start << 16 | width. Readers return
+// 2 where the words fit no symbols; they never read beyond the words.
+
+typedef struct {
+  const uint16_t* words;           // [count]
+  int64_t count, at, operations;   // words, and how many words and operations were read
+  int64_t state[4];                // of the coder
+} SeCodeReader;
+
+// Append the operations of values [count], expected near mean [count] (1/8 of a step) with a spread of scale [count] (1/8 of an octave, 0 to
+// 127, from 1/16 of a step); room for 6 count operations. Return how many were written.
+SE_EXPORT int64_t se_code_symbols(const int32_t* values, const int32_t* mean, const int32_t* scale, int64_t count, uint32_t* operations);
+// The operations [count] of bits [count] with odds [count] of a one: 2^((odds - 64) / 8), odds 0 to 127.
+SE_EXPORT void se_code_bits(const uint8_t* bits, const int32_t* odds, int64_t count, uint32_t* operations);
+// The words of operations [count]; room for count + 8. Return how many words were written.
+SE_EXPORT int64_t se_code_pack(const uint32_t* operations, int64_t count, uint16_t* words);
+// Set at, operations and state to the begin of the words.
+SE_EXPORT int32_t se_code_start(SeCodeReader* reader);
+SE_EXPORT int32_t se_code_read(SeCodeReader* reader, const int32_t* mean, const int32_t* scale, int64_t count, int32_t* values);
+SE_EXPORT int32_t se_code_read_bits(SeCodeReader* reader, const int32_t* odds, int64_t count, uint8_t* bits);
+// Operations of the octree of distinct ascending Morton keys [count] of 3 depth bits. Return their number, of which at most `capacity` were
+// written; -1: out of memory.
+SE_EXPORT int64_t se_code_cells(const int64_t* keys, int64_t count, int32_t depth, uint32_t* operations, int64_t capacity);
+SE_EXPORT int32_t se_code_read_cells(SeCodeReader* reader, int32_t depth, int64_t count, int64_t* keys);
+// mean and scale [count] of a channel from inputs [D, stride] of which the first `count` columns are used: weights [2, D] of both, numbers
+// [4] = bias and shift of both, classes [count] of the anchors (a step is 2^class times the channel's).
+SE_EXPORT void se_code_predict(const int16_t* inputs, int64_t stride, const int8_t* weights, const int32_t* numbers, int64_t D,
+                               const int8_t* classes, int64_t count, int32_t* mean, int32_t* scale);
+// out [count]: values as inputs, (4 * 2^class value factor - offset) / 2^12, within +-2047; factor at least 1.
+SE_EXPORT void se_code_inputs(const int32_t* values, const int8_t* classes, int64_t count, int32_t factor, int32_t offset, int16_t* out);
+// out [C, count]: weighted means of columns [C, N] at parents [count, 4] with weights [count, 4] in 1/256.
+SE_EXPORT void se_code_blend(const int16_t* columns, int64_t N, int64_t C, const int32_t* parents, const int32_t* weights, int64_t count,
+                             int16_t* out);
+// The two rows before and the two after each of rows [count] among coarse [coarse_count] (both ascending), and their weights by the distance
+// of cells [N, 3].
+SE_EXPORT void se_code_parents(const int32_t* cells, const int32_t* rows, int64_t count, const int32_t* coarse, int64_t coarse_count,
+                               int32_t* parents, int32_t* weights);
 
 #endif

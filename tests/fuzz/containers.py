@@ -15,6 +15,7 @@ from safetensors.torch import load, save
 
 from fuzz.mutate import mutate, mutate_json
 from scene_experts.core import checkpoint
+from scene_experts.files.codec import container
 
 
 def gzipped(data: bytes, rng: random.Random) -> bytes:
@@ -80,6 +81,28 @@ def tensors(data: bytes, rng: random.Random) -> bytes:
     try:
         return save(found, {checkpoint.KEY: json.dumps(head)})
     except UnicodeEncodeError:
+        return data
+
+
+def compact(data: bytes, rng: random.Random) -> bytes:
+    """The header or a part of a compact file changed, under a fresh checksum."""
+    header, parts = container.part(data)
+    name, kind = rng.choice(sorted(parts)), rng.randrange(8)
+    if kind < 3:
+        try:
+            changed = json.loads(mutate_json(json.dumps(header), rng))
+            header = changed if isinstance(changed, dict) else {}
+        except (ValueError, RecursionError):
+            header = {}
+    elif kind == 3:
+        del parts[name]
+    elif kind == 4:
+        parts[name] = parts[rng.choice(sorted(parts))]
+    else:
+        parts[name] = mutate(parts[name], rng)
+    try:
+        return container.join(header, parts)
+    except (ValueError, TypeError, RecursionError):  # numbers that JSON does not have
         return data
 
 

@@ -393,7 +393,7 @@ def _scene_of_compact(folder: Path) -> Any:
 
 
 _JSON = {".json": mutate_json, ".gltf": mutate_json}
-_TENSORS = {".safetensors": containers.tensors, ".compact": containers.tensors}
+_TENSORS = {".safetensors": containers.tensors}
 TARGETS: dict[str, Target] = {
     "ply": Target(_gaussians("ply"), _read_only_file),
     "ply-ascii": Target(_ply_texts, _read_only_file),
@@ -412,7 +412,7 @@ TARGETS: dict[str, Target] = {
     "ksplat": Target(_foreign("scene.ksplat", lambda s: foreign.ksplat(s, 2, 8, sections=2)), _read_only_file),
     "ksplat-0": Target(_foreign("scene.ksplat", lambda s: foreign.ksplat(s, 0)), _read_only_file),
     "zip": Target(_zip, _read_only_file, packs={".zip": containers.zipped}),
-    "compact": Target(_compact, _scene_of_compact, packs=_TENSORS),
+    "compact": Target(_compact, _scene_of_compact, packs={".compact": containers.compact}),
     "networks": Target(_networks, lambda folder: read_tensors(folder / "net.pt"), packs={".pt": containers.zipped}),
     "torchscript": Target(_traces, lambda folder: read_tensors(folder / "net.pt"), packs={".pt": containers.zipped}),
     "result-folder": Target(_result, _read_result, packs={".pt": containers.zipped}),

@@ -260,6 +260,8 @@ class Run:
         format: str = "compact",
         out: str | Path | None = None,
         *,
+        quality: float = 0.2,
+        target_mb: float = 0.0,
         sh_degree: int = 3,
         max_gaussians: int = 0,
         prune: float = 0.0,
@@ -278,6 +280,9 @@ class Run:
                 them, which takes minutes.
             out: File or folder; a name without a suffix is a folder. Default: inside the run
                 folder.
+            quality: compact: dB of PSNR that the training views may lose.
+            target_mb: compact: write a file of at most this many megabytes in place of `quality`; 0:
+                any size.
             sh_degree: Standard files: degree of the spherical harmonics, 0 to 3.
             max_gaussians: Standard files: keep this many Gaussians, those that contribute most; 0
                 keeps all.
@@ -301,7 +306,7 @@ class Run:
                 unknown or out of range.
             RunError: The disk is full.
         """
-        options = Options(False, sh_degree, max_gaussians, prune, refine, frame, crop, floaters, title)
+        options = Options(False, quality, target_mb, sh_degree, max_gaussians, prune, refine, frame, crop, floaters, title)
         expect_words(options)
         folder, opened = self._in_folder("export"), self._opened
         if self._device != "cpu":

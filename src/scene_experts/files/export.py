@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from scene_experts.files.standard import ExportTask, Made, Written, export_gauss
 from scene_experts.render import Rasterizer
 from scene_experts.training.run_folder import OpenRun
 
+FITTED = ("quality", "target_mb")  # options of formats that choose a precision
 NAME = "scene"  # of files whose name the caller does not choose
 
 
@@ -92,7 +94,8 @@ def export_several(
             check_writable(places[-1])
             if work.format.needs is not None:
                 work.format.needs()
-    own = Options(measure=options.measure) if standard else options  # the other options are those of the standard files then
+    # the other options are those of the standard files then
+    own = Options(measure=options.measure, quality=options.quality, target_mb=options.target_mb) if standard else options
     written = [_export_scene(replace(work, options=own), out) for work in works if work.format.family != GAUSSIANS]
     if standard:
         made: dict[tuple[int | None, int], Made] = {}
@@ -167,14 +170,26 @@ def _check(options: Options) -> None:
         from scene_experts.files.select import parse_crop
 
         parse_crop(options.crop)
+    if not 0 < options.quality < math.inf:
+        raise InputError(f"expected --quality above 0 dB, found {options.quality}; 0.2 is usual")
+    if not 0 <= options.target_mb < math.inf:
+        raise InputError(f"expected --target-mb as megabytes above 0, found {options.target_mb}; correct it")
+    if options.target_mb and options.quality != DEFAULT.quality:
+        raise InputError("expected --quality or --target-mb, found both; leave one out")
     if not 0 <= options.prune < 1:
         raise InputError(f"expected --prune as a share from 0 to below 1, found {options.prune}; correct it")
 
 
 def _expect_unused(options: Options, format: str) -> None:
-    """Raises InputError for options of standard files with a format that is none."""
+    """Raises InputError for options of standard files with a format that is none, and for those of
+    formats with a precision with another one."""
     for f in fields(options):
-        if f.name != "measure" and getattr(options, f.name) != f.default:
+        if f.name == "measure" or getattr(options, f.name) == f.default:
+            continue
+        if f.name in FITTED:
+            if format_named(format).fit is None:
+                raise InputError(f"expected {_flag(f.name)} with --format compact, found --format {format}; leave it out")
+        else:
             raise InputError(f"expected {_flag(f.name)} with a standard file (ply, spz, html, ...), found --format {format}; leave it out")
 
 
@@ -199,10 +214,14 @@ def _export_scene(work: ExportTask, out: Path | None) -> Written:
     path = place_of(run, work.name, format, out)
     origin = origin_of(run, trained)
     about, world = family.describe(run, trained) | trained_in(run) | origin_note(origin), trained.seen_from(origin)
-    detail = format.write(path, family.contents(run, world, about), {})  # type: ignore[misc]
+    contents, fitted = family.contents(run, world, about), []
+    if format.fit is not None:
+        with capture_if_there(run, needed=False) as capture:
+            contents, fitted = format.fit(run, contents, trained, work.options, capture, work.rasterize, work.tell)
+    detail = format.write(path, contents, {})  # type: ignore[misc]
     rows, size = len(run.scene.positions), path.stat().st_size
     said = f"{rows:,} {traits.rows}, {size / 1e6:.2f} MB with networks" + (f", {detail}" if detail is not None else "")
-    written = Written(path, size, rows, (f"wrote {path}", said))
+    written = Written(path, size, rows, (f"wrote {path}", said, *fitted))
     if not work.options.measure or format.read is None:
         return written
     with capture_if_there(run, needed=False) as capture:

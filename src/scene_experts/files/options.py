@@ -13,12 +13,17 @@ MAX_DEGREE = 3  # of spherical harmonics in any format
 
 @dataclass(frozen=True)
 class Options:
-    """What to write, and whether to measure it. All but `measure` are for formats of standard
-    Gaussians."""
+    """What to write, and whether to measure it. All but `measure`, `quality` and `target_mb` are for
+    formats of standard Gaussians."""
 
     measure: bool = True
     """Draw the held-out views from the run and from the file, and say what the file costs in
     PSNR."""
+    quality: float = 0.2
+    """compact: dB of PSNR that the training views may lose; held-out views lose less."""
+    target_mb: float = 0.0
+    """compact: write a file of at most this many megabytes (10^6 bytes), as good as it can be, in
+    place of --quality; 0: any size."""
     sh_degree: int = MAX_DEGREE
     """Standard files: degree of the spherical harmonics, 0 (smallest file) to 3 (best)."""
     max_gaussians: int = 0

@@ -109,6 +109,12 @@ class Format:
     """view_note(capture, world): entries about the capture's cameras that the writer adds to the
     note."""
 
+    fit: Callable[..., tuple[Any, list[str]]] | None = None
+    """fit(run, contents, world, options, capture, rasterize, tell): contents as precise as the
+    options ask for (`quality`, `target_mb`), and sentences about that for the terminal. world: of
+    the run, in the frame of its capture. capture: None where it is gone. None: contents are written
+    as they are, and those options are refused."""
+
     @property
     def is_folder(self) -> bool:
         """Whether it is the result folder of a family and not a file."""

@@ -12,7 +12,7 @@ import ctypes
 from ctypes import POINTER, Structure, c_double, c_float, c_int32, c_int64, c_void_p
 from typing import Any
 
-ABI_VERSION = 11
+ABI_VERSION = 12
 
 HEAD_TENSORS = ("router_w", "router_b", "w1", "b1", "middle_w", "middle_b", "w2", "b2")
 """The weights of a decoder head, in the order of `SeDecodeHead`."""
@@ -84,7 +84,20 @@ class SeSweep(Structure):
     ]
 
 
-STRUCTURES: tuple[type[Structure], ...] = (SeCamera, SeRasterForward, SeRasterBackward, SeDecodeHead, SeDecode, SeAdamTensor, SeSweep)
+class SeCodeReader(Structure):
+    _fields_ = [("words", c_void_p), *_fields(c_int64, "count", "at", "operations"), ("state", c_int64 * 4)]
+
+
+STRUCTURES: tuple[type[Structure], ...] = (
+    SeCamera,
+    SeRasterForward,
+    SeRasterBackward,
+    SeDecodeHead,
+    SeDecode,
+    SeAdamTensor,
+    SeSweep,
+    SeCodeReader,
+)
 
 _P, _I, _L, _F, _D = c_void_p, c_int32, c_int64, c_float, c_double
 FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
@@ -120,6 +133,18 @@ FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "se_sweep_match": (_I, (POINTER(SeSweep),)),
     "se_sweep_agree": (_I, (POINTER(SeSweep), _P, _P, _F, _F, _D, _P)),
     "se_sweep_compare": (_I, (POINTER(SeSweep), _P, _L, _D, _D, _P, _P)),
+    "se_code_symbols": (_L, (_P, _P, _P, _L, _P)),
+    "se_code_bits": (None, (_P, _P, _L, _P)),
+    "se_code_pack": (_L, (_P, _L, _P)),
+    "se_code_start": (_I, (POINTER(SeCodeReader),)),
+    "se_code_read": (_I, (POINTER(SeCodeReader), _P, _P, _L, _P)),
+    "se_code_read_bits": (_I, (POINTER(SeCodeReader), _P, _L, _P)),
+    "se_code_cells": (_L, (_P, _L, _I, _P, _L)),
+    "se_code_read_cells": (_I, (POINTER(SeCodeReader), _I, _L, _P)),
+    "se_code_predict": (None, (_P, _L, _P, _P, _L, _P, _L, _P, _P)),
+    "se_code_inputs": (None, (_P, _P, _L, _I, _I, _P)),
+    "se_code_blend": (None, (_P, _L, _L, _P, _P, _L, _P)),
+    "se_code_parents": (None, (_P, _P, _L, _P, _L, _P, _P)),
 }
 """Result and argument types of every exported function, by name."""
 

@@ -31,6 +31,20 @@ def test_options_of_standard_files_are_not_ignored_elsewhere():
             _expect_unused(Options(**{name: value}), "compact")
 
 
+def test_a_precision_is_for_compact_files_and_in_range():
+    for options in (Options(quality=0.1), Options(target_mb=1.5)):
+        _check(options)
+        _expect_unused(options, "compact")
+        with pytest.raises(InputError, match=naming("--format compact", "anchors")):
+            _expect_unused(options, "anchors")
+    for name, values in {"quality": (0.0, -1.0, float("nan"), float("inf")), "target_mb": (-1.0, float("nan"), float("inf"))}.items():
+        for value in values:
+            with pytest.raises(InputError, match=naming("--" + name.replace("_", "-"))):
+                _check(Options(**{name: value}))
+    with pytest.raises(InputError, match=naming("--quality", "--target-mb")):
+        _check(Options(quality=0.1, target_mb=1.0))
+
+
 def test_the_help_needs_no_torch():
     code = "import sys, scene_experts.files.options, scene_experts.files.registry; print('torch' in sys.modules, 'numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split() == ["False", "False"]

@@ -103,7 +103,7 @@ GLB = Budget("glTF file", 64 * GIB, floor=64 * MIB, ratio=10, items=20_000, othe
 USD = Budget("OpenUSD file", 64 * GIB, other=CONVERT)
 HTML = Budget("html page", 16 * GIB, ratio=32, other=CONVERT)
 ZIP = Budget("zip file", 64 * GIB, floor=32 * MIB, ratio=4, items=20_000, other="unpack it and give the file or folder of the scene")
-COMPACT = Budget("compact scene", 64 * GIB, other="export it again")
+COMPACT = Budget("compact scene", 64 * GIB, ratio=64, seconds=60.0, other="export it again")  # seconds: without the compiled library
 RUN = Budget("run folder", 1 << 60, advice="restore its files or train again")
 CHECKPOINT = Budget("checkpoint", 1 << 40, items=100_000, advice="use an older one or copy it again")
 NETWORK = Budget("network file", 16 * GIB, floor=128 * MIB, ratio=4, items=200_000, depth=50, advice="get it again")

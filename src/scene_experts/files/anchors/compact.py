@@ -1,55 +1,59 @@
-"""One small file of this package, networks included: exact positions, 16-bit features and lengths.
+"""One small file of this package, networks included: about a megabyte for a scene of 22,000 anchors.
 
-The networks are stored as they are. An anchor takes 316 bytes in Scaffold-GS's PLY; 32 of them are
-constants (normals, opacity, rotation) and 12 a position on a known lattice. Here a position is an
-integer cell (1 to 4 bytes, exact), features and offsets are half precision, and log-scalings are
-16-bit fixed point per channel, because halves are coarse where scalings lie (steps of 0.004 between
-4 and 8, 0.2 % of a length). Offsets of masked Gaussians are left out; one bit per Gaussian marks
-them. Bytes are grouped by significance and deflated. The file is a safetensors file with a
-checksum. Rows come back in another order, which does not change pictures.
-
-Cells are sorted along the Morton curve, which interleaves the bits of the axes so that near cells
-have near keys, and stored as steps along it, each in as many 7-bit groups as it needs.
+Positions are exact; other values are rounded to steps that follow from what a rounding does to the
+pictures (`precision`), and entropy coded with models that were fitted to the scene (`codec`).
+docs/compact-file.md states every byte. Rows come back in another order, which does not change
+pictures.
 """
 
 from __future__ import annotations
 
+import math
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
-from scene_experts.core.checkpoint import read_tensors, write_tensors
 from scene_experts.core.errors import InputError
+from scene_experts.core.io import write_bytes
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.budget import Damaged
-from scene_experts.core.reading.numbers import FARTHEST, number, shown, whole_number
+from scene_experts.core.reading.numbers import FARTHEST, LARGEST, number, whole_number
 from scene_experts.core.reading.source import Source, opening
+from scene_experts.data.views import Capture, World
 from scene_experts.files.anchors.data import AnchorData
-from scene_experts.files.formats.morton import AXIS_BITS, Keys, morton, unmorton
+from scene_experts.files.anchors.places import MOST_LATTICES, AnchorPlaces, Lattice, find_places, read_places, write_places
+from scene_experts.files.anchors.precision import rows_of
+from scene_experts.files.anchors.quality import choose_precision
+from scene_experts.files.anchors.rounding import FURTHER, WholeScene, restore, round_scene
+from scene_experts.files.codec import container
+from scene_experts.files.codec.fit import fit_models
+from scene_experts.files.codec.groups import EXTRA, FEATURE, OFFSETS, ORDER, SCALING, SLOTS, Walk, anchor_groups
+from scene_experts.files.codec.numbers import Rounded, code_models, code_rounded, reading, writing
+from scene_experts.files.codec.order import CodingOrder, choose_boxes
+from scene_experts.files.codec.streams import SymbolReader, SymbolWriter
+from scene_experts.files.measure import Tell
+from scene_experts.files.options import Options
 from scene_experts.files.registry import Format
+from scene_experts.render import Rasterizer
+from scene_experts.training.run_folder import OpenRun
 
-KIND, VERSION = "compact scene", 1
-MOST_ANCHORS, MOST_CHANNELS = 1 << 28, 1 << 12  # of a file; K and F
-FARTHEST_CELL = 1 << 52  # coordinate of a cell
-Code = Literal["float32", "float16", "uint16", "uint8"]
-_GROUP = 7
-_MAX_GROUPS = 9  # 63 bits
-
-
-@dataclass(frozen=True)
-class Coding:
-    """How the columns are stored. uint16 and uint8 are fixed point between the minimum and maximum
-    of each channel."""
-
-    feature: Code = "float16"
-    offsets: Code = "float16"
-    log_scaling: Code = "uint16"
+VERSION = 2
+MOST_ANCHORS, MOST_CHANNELS, MOST_SLOTS = 1 << 28, 1024, 256  # of a file; F and K
+MOST_TENSORS, MOST_VALUES = 1000, 1 << 28
+BYTES_PER_VALUE = 16  # in memory, while a file is read
+POSITIONS, MODELS, NETWORKS, EXACT = "positions", "models", "networks", "exact"  # names of parts, beside those of the groups
+_LABELS = {
+    "class": "classes",
+    "feature": "features",
+    "scaling": "scalings",
+    "slots": "masks",
+    "models": "context models",
+    "exact": "routers",
+}
 
 
 @dataclass(frozen=True)
@@ -57,103 +61,203 @@ class Sizes:
     """Bytes of a compact file."""
 
     total: int
-    anchors: int
-    networks: int
-    per_anchor: float
+    parts: dict[str, int]
+    """By part; the rest of the total is the header."""
+    anchors: int  # their number
+
+    @property
+    def per_anchor(self) -> float:
+        """Bytes of an anchor, with its share of everything else."""
+        return self.total / max(self.anchors, 1)
 
     def __str__(self) -> str:
-        return f"{self.per_anchor:.1f} bytes per anchor without the networks"
+        parts = {_LABELS.get(name, name): size for name, size in self.parts.items() if size}
+        parts["header"] = self.total - sum(self.parts.values())
+        return f"{self.per_anchor:.1f} bytes per anchor: " + ", ".join(f"{name} {size:,}" for name, size in parts.items())
 
 
-def write(path: Path, data: AnchorData, note: dict[str, Any], coding: Coding = Coding()) -> Sizes:
+def write(path: Path, data: AnchorData, note: dict[str, Any]) -> Sizes:
     """Write a scene to one file, atomically. The note has no place in it: the description says
     more.
 
-    Raises InputError for anchors on no lattice or on several, for values that are not finite, and
-    for cells that span more than 2^21 voxels; RunError when the disk is full.
+    Raises InputError for anchors on no known lattice, for values that are not finite or too large,
+    and for cells that span more than 2^21 voxels; RunError when the disk is full.
     """
-    if "level" in data.columns:
-        raise InputError("expected anchors on one lattice for a compact file, found levels of detail; use --format anchors")
-    if data.cells is None:
-        raise InputError("expected anchors on a lattice of known voxel size for a compact file, found others; use --format anchors")
-    place = data.cells.detach().cpu().numpy().astype(np.int64)
-    low = place.min(0) if len(place) else np.zeros(3, np.int64)
-    spread = int((place.max(0) - low).max()) if len(place) else 0
-    if spread >= 1 << AXIS_BITS:
-        raise InputError(f"expected a scene at most {1 << AXIS_BITS:,} voxels wide, found {spread + 1:,}; remove far anchors")
-    keys = morton(place - low)
-    order = np.argsort(keys, kind="stable")
-    blobs = {"cells": deflate(encode_steps(keys[order]))}
-    codes, n, slots = {}, len(place), data.columns.get("slots")
-    drawn = None if slots is None else slots.cpu().numpy()[order]
-    if drawn is not None:
-        blobs["slots"] = deflate(np.packbits(drawn, axis=1))
-    for name in (name for name in ("feature", "offsets", "log_scaling", "interval") if name in data.columns):
-        value = data.columns[name]
-        array = value.detach().cpu().float().numpy().reshape(n, int(np.prod(value.shape[1:])))[order]
-        if drawn is not None and name == "offsets":  # those of masked slots are left out
-            array = array.reshape(*drawn.shape, 3)[drawn]
-        if not np.isfinite(array).all():
-            raise InputError(f"expected finite {name}, found others in {(~np.isfinite(array)).any(1).sum():,} anchors; train again")
-        codes[name], parts = _encode(array, getattr(coding, name, "float32"))
-        blobs |= {name if part == "values" else f"{name}.{part}": blob for part, blob in parts.items()}
-    meta = {
+    encoded, sizes = encode(data)
+    write_bytes(Path(path), encoded)
+    return sizes
+
+
+def encode(data: AnchorData) -> tuple[bytes, Sizes]:
+    """The bytes of a scene's file, and their sizes. Raises InputError as `write`."""
+    places, along = find_places(data)
+    n, F, K = len(along), data.columns["feature"].shape[1], data.columns["offsets"].shape[1]
+    if F > MOST_CHANNELS or K > MOST_SLOTS:
+        raise InputError(f"expected at most {MOST_CHANNELS} channels and {MOST_SLOTS} Gaussians for a compact file, found {F} and {K}")
+    whole = round_scene(data)
+    boxes = choose_boxes(places.keys)
+    way = CodingOrder.of(places.keys, boxes)
+    places, along = places.ordered(way.rows), along[way.rows]
+    values = {name: np.ascontiguousarray(value[:, along]) for name, value in whole.values.items()}
+    groups = anchor_groups(F, K, SLOTS in values, len(whole.extra))
+    models = fit_models(groups, way, values)
+    cells, numbers, weights = SymbolWriter(), SymbolWriter(), SymbolWriter()
+    write_places(places, cells)
+    models = code_models(writing(numbers), groups, models)
+    for rounded in whole.networks.values():
+        code_rounded(writing(weights), (len(rounded.values), *rounded.values.shape[1:]), rounded)
+    parts = {POSITIONS: cells.pack(), MODELS: numbers.pack()}
+    parts |= {name: stream.pack() for name, stream in Walk(groups, way, models).write(values).items()}
+    exact = zlib.compress(b"".join(value.astype("<f4").tobytes() for value in whole.exact.values()), 9)
+    parts |= {NETWORKS: weights.pack(), EXACT: exact}
+    header = {
+        "version": VERSION,
         "N": n,
-        "K": data.columns["offsets"].shape[1],
-        "F": data.columns["feature"].shape[1],
-        "voxel": data.voxel,
+        "F": F,
+        "K": K,
+        "slots": SLOTS in values,
+        "extra": whole.extra,
+        "steps": whole.steps,
+        "levels": bool(data.edges),
+        "lattices": [lattice.plain() for lattice in places.lattices],
         "origin": list(data.origin),
-        "low": low.tolist(),
-        "codes": codes,
+        "voxel": data.voxel,
+        "boxes": list(boxes),
+        "networks": [[name, list(data.networks[name].shape)] for name in (*whole.networks, *whole.exact)],
+        "rounded": len(whole.networks),
+        "integers": checksum(places, replace(whole, values=values)),
         "scene": data.about,
     }
-    tensors = {name: torch.from_numpy(np.ascontiguousarray(blob)) for name, blob in blobs.items()}
-    flat = {f"network.{name}": value.detach().cpu() for name, value in data.networks.items()}
-    write_tensors(Path(path), tensors | flat, KIND, VERSION, meta)
-    anchors = sum(t.numel() * t.element_size() for t in tensors.values())
-    return Sizes(Path(path).stat().st_size, anchors, sum(t.numel() * t.element_size() for t in flat.values()), anchors / max(n, 1))
+    encoded = container.join(header, parts)
+    return encoded, Sizes(len(encoded), {name: len(part) for name, part in parts.items()}, n)
+
+
+def checksum(places: AnchorPlaces, whole: WholeScene) -> int:
+    """CRC-32 of all numbers, 32 bits each, low byte first: fine cells [N, 3], the groups [C, N], values
+    [E, R, C] and exponents [R] of each network, then the tensors that are held as they are."""
+    found = 0
+    for array in (
+        places.fine,
+        *(whole.values[name] for name in ORDER if name in whole.values),
+        *(a for r in whole.networks.values() for a in (r.values, r.exponents)),
+    ):
+        found = zlib.crc32(np.ascontiguousarray(array, "<i4").data, found)
+    for array in whole.exact.values():
+        found = zlib.crc32(np.ascontiguousarray(array, "<f4").data, found)
+    return found
 
 
 def read(path: Path) -> AnchorData:
-    """The scene in a file. Raises InputError for a missing, damaged or other file and for another
-    format version."""
-    tensors, meta = read_tensors(path, KIND, VERSION)
+    """The scene in a file. Raises InputError for a missing, damaged or other file and for one of
+    version 1."""
     with opening(path, budget.COMPACT) as source:
-        return _unpack(source, tensors, meta)
+        head = source.head(4096)
+        if not head.startswith(container.MARK) and head[8:9] == b"{" and b"compact scene" in head:
+            raise InputError(f"expected a compact file of version {VERSION} at {path}, found version 1; export its run again")
+        return _decode(source)
 
 
-def _unpack(source: Source, tensors: dict[str, Tensor], meta: dict[str, Any]) -> AnchorData:
-    n = whole_number(meta["N"], "the number of anchors", 0, MOST_ANCHORS)
-    K, F = whole_number(meta["K"], "K", 1, MOST_CHANNELS), whole_number(meta["F"], "F", 1, MOST_CHANNELS)
-    source.spend_bytes(n * 8 * (3 * K + F + 6 + 12))
-    low = np.array([whole_number(v, "a corner of the cells", -FARTHEST_CELL, FARTHEST_CELL) for v in meta["low"]], np.int64)
-    origin = tuple(number(v, "the origin of the cells", -FARTHEST, FARTHEST) for v in meta["origin"])
-    voxel = number(meta["voxel"], "the edge of a cell", 1e-30, FARTHEST)
-    about = dict(meta["scene"])
-    keys = decode_steps(inflate(_blob(tensors, "cells"), 9 * n, exact=False))
-    if len(keys) != n or low.shape != (3,) or len(origin) != 3:
-        raise Damaged(f"{len(keys):,} cells of {n:,} anchors")
-    slots = _decode_slots(_blob(tensors, "slots"), n, K) if "slots" in tensors else None
-    sizes = {"feature": (n, F), "offsets": (n, 3 * K) if slots is None else (int(slots.sum()), 3), "log_scaling": (n, 6)}
-    sizes |= {"interval": (n, 1)} if "interval" in tensors else {}
-    columns = {name: _decode(tensors, name, meta["codes"][name], *size) for name, size in sizes.items()}
-    step = whole_number(about["step"], "the iteration")
-    add_dist = tuple(a for a, used in about["add_dist"].items() if used)
-    cells = torch.from_numpy(unmorton(keys) + low)
-    columns |= {"interval": columns["interval"][:, 0]} if "interval" in columns else {}
-    if slots is not None:
-        columns["slots"] = slots
-        columns["offsets"] = torch.zeros(n, K, 3).index_put_((slots,), columns["offsets"])
-    columns["offsets"] = columns["offsets"].reshape(n, K, 3)
-    columns = {"xyz": (cells.double() * voxel + torch.tensor(origin, dtype=torch.float64)).float()} | columns
-    networks = {name.removeprefix("network."): value for name, value in tensors.items() if name.startswith("network.")}
-    return AnchorData(columns, networks, about, cells, voxel, origin, add_dist, step).checked()
+def _decode(source: Source) -> AnchorData:
+    header, parts = container.part(source.read())
+    if header["version"] != VERSION:
+        raise Damaged(f"version {header['version']!r} of the format, not {VERSION}")
+    n = whole_number(header["N"], "the number of anchors", 0, MOST_ANCHORS)
+    F, K = whole_number(header["F"], "F", 1, MOST_CHANNELS), whole_number(header["K"], "K", 1, MOST_SLOTS)
+    source.spend_bytes(n * BYTES_PER_VALUE * (3 * K + F + 18))
+    extra = [str(name) for name in header["extra"]]
+    if any(name not in FURTHER for name in extra) or len(set(extra)) < len(extra):
+        raise Damaged("an unknown column")
+    shapes = _shapes(header["networks"])
+    source.spend_bytes(8 * sum(math.prod(shape) for shape in shapes.values()))
+    origin = tuple(number(v, "the origin of the cells", -FARTHEST, FARTHEST) for v in header["origin"])
+    lattices = [Lattice.from_plain(value, n) for value in header["lattices"][:MOST_LATTICES]]
+    if sum(lattice.count for lattice in lattices) != n or len(origin) != 3:
+        raise Damaged(f"cells of another number than {n:,} anchors")
+    places = read_places(lattices, SymbolReader(parts[POSITIONS]))
+    source.check_time()
+    groups = anchor_groups(F, K, bool(header["slots"]), len(extra))
+    first, second = (whole_number(v, "the bits of a box", 0, 63) for v in header["boxes"])
+    way = CodingOrder.of(places.keys, (first, second))
+    places = places.ordered(way.rows)
+    stream = SymbolReader(parts[MODELS])
+    models = code_models(reading(stream), groups, None)
+    stream.finish()
+    values = Walk(groups, way, models).read(parts)
+    source.check_time()
+    count = whole_number(header["rounded"], "the number of networks", 0, len(shapes))
+    whole = WholeScene(values, _steps(header["steps"], F, K, extra), extra, *_networks(parts, shapes, count))
+    if checksum(places, whole) != header["integers"]:
+        raise Damaged("numbers with another checksum")
+    about = dict(header["scene"]) if header["scene"] is not None else None
+    columns = places.columns(origin)  # type: ignore[arg-type]
+    has_levels = header["levels"] is True
+    columns |= {"level": places.levels()} if has_levels else {}
+    voxel = number(header["voxel"], "the edge of a cell", 0, FARTHEST)
+    step = whole_number((about or {}).get("step", 0), "the iteration")
+    add_dist = tuple(a for a, used in (about or {}).get("add_dist", {}).items() if used)
+    found = AnchorData(columns, {}, about, None, voxel, origin, add_dist, step)  # type: ignore[arg-type]
+    found = restore(whole, found, shapes)
+    if not has_levels:
+        found = replace(found, cells=torch.from_numpy(places.cells))
+    return found.checked()
+
+
+def _shapes(listed: Any) -> dict[str, tuple[int, ...]]:
+    """The shapes of the networks' tensors by name. Raises Damaged for shapes that are none."""
+    out = {}
+    for name, shape in listed[:MOST_TENSORS]:
+        out[str(name)] = tuple(whole_number(v, f"the shape of {name}", 1, 1 << 24) for v in shape)
+        if not 1 <= len(shape) <= 3 or math.prod(out[str(name)]) > MOST_VALUES:
+            raise Damaged(f"a network {name} of another shape")
+    if len(out) != len(listed):
+        raise Damaged("networks of the same name, or too many")
+    return out
+
+
+def _steps(value: Any, F: int, K: int, extra: list[str]) -> dict[str, list[float]]:
+    wanted = {FEATURE: F, SCALING: 6, OFFSETS: 3 * K} | ({EXTRA: len(extra)} if extra else {})
+    found = {name: [number(v, "a step", 1e-30, LARGEST) for v in value[name]] for name in wanted}
+    if any(len(found[name]) != size for name, size in wanted.items()):
+        raise Damaged("steps of another number of channels")
+    return found
+
+
+def _networks(parts: dict[str, bytes], shapes: dict[str, tuple[int, ...]], count: int) -> tuple[dict[str, Rounded], dict[str, Any]]:
+    """The networks' tensors as whole numbers, the first `count`, and the others as they are."""
+    stream, rounded, exact, at = SymbolReader(parts[NETWORKS]), {}, {}, 0
+    machine = zlib.decompressobj()
+    floats = machine.decompress(parts[EXACT], 4 * sum(math.prod(shape) for shape in list(shapes.values())[count:]) + 1)
+    for i, (name, shape) in enumerate(shapes.items()):
+        if i < count:
+            E, R, C = rows_of(name, torch.empty(shape, device="meta")).shape
+            rounded[name] = code_rounded(reading(stream), (E, R, C), None)
+        else:
+            size = 4 * math.prod(shape)
+            exact[name] = np.frombuffer(floats[at : at + size], "<f4").astype(np.float32)
+            at += size
+    stream.finish()
+    if at != len(floats) or not machine.eof or machine.unused_data:
+        raise Damaged("networks of another size")
+    return rounded, exact
+
+
+def fit(
+    run: OpenRun,
+    contents: AnchorData,
+    world: World,
+    options: Options,
+    capture: Capture | None,
+    rasterize: Rasterizer | None,
+    tell: Tell,
+) -> tuple[AnchorData, list[str]]:
+    """See `registry.Format.fit`."""
+    return choose_precision(run, contents, world, options, capture, rasterize, tell, lambda data: encode(data)[1].total)
 
 
 def looks_like(path: Path, head: bytes) -> bool:
-    """Whether a file is meant as a compact one: by its name, or by the start of a safetensors file
-    (length of a JSON header, header)."""
-    return path.suffix == FORMAT.suffix or (head[8:9] == b"{" and 2 <= int.from_bytes(head[:8], "little") < path.stat().st_size)
+    """Whether a file is meant as a compact one: by its mark, by its name, or by the start of a file
+    of version 1."""
+    return head.startswith(container.MARK) or path.suffix == FORMAT.suffix or (head[8:9] == b"{" and b"compact scene" in head)
 
 
 FORMAT = Format(
@@ -162,94 +266,5 @@ FORMAT = Format(
     write=write,
     read=read,
     looks_like=looks_like,
+    fit=fit,
 )
-
-
-# --- columns ------------------------------------------------------------------------------------------------------------------------------
-
-
-def _encode(array: NDArray[np.float32], code: Code) -> tuple[Code, dict[str, NDArray[Any]]]:
-    """The code and the stored parts, by name, of one array [N, C]. Fixed point stores a minimum
-    (low) and a step per channel."""
-    if code == "float16" and array.size and np.abs(array).max() > float(np.finfo(np.float16).max):
-        code = "float32"  # too large for half precision
-    if code in ("float32", "float16"):
-        return code, {"values": deflate(array.astype(code))}
-    steps = float(np.iinfo(code).max)
-    low = array.min(0).astype(np.float64) if len(array) else np.zeros(array.shape[1])
-    step = (array.max(0) - low) / steps if len(array) else np.zeros(array.shape[1])
-    level = np.rint((array - low) / np.where(step > 0, step, 1.0)).clip(0, steps)
-    return code, {"values": deflate(level.astype(code)), "low": low, "step": step}
-
-
-def _decode(tensors: dict[str, Tensor], name: str, code: str, n: int, width: int) -> Tensor:
-    """The inverse of `_encode`, [N, C] float32."""
-    if code not in ("float32", "float16", "uint16", "uint8"):
-        raise Damaged(f"the code {shown(code)}")
-    item = np.dtype(code)
-    planes = inflate(_blob(tensors, name), n * width * item.itemsize).reshape(width, item.itemsize, n)
-    values = np.ascontiguousarray(planes.transpose(2, 0, 1)).reshape(n, width * item.itemsize).view(item.newbyteorder("<"))
-    if item.kind == "u":
-        low, step = (tensors[f"{name}.{part}"].double().numpy() for part in ("low", "step"))
-        if low.shape != (width,) or step.shape != (width,):
-            raise Damaged(f"{len(low)} ranges of the {width} channels of {name}")
-        values = values * step + low
-    return torch.from_numpy(np.ascontiguousarray(values.astype(np.float32)))
-
-
-def _decode_slots(blob: NDArray[np.uint8], n: int, K: int) -> Tensor:
-    """The masks [N, K] bool of slots."""
-    planes = inflate(blob, n * -(-K // 8)).reshape(-(-K // 8), n)
-    return torch.from_numpy(np.ascontiguousarray(np.unpackbits(planes.T, axis=1, count=K).astype(bool)))
-
-
-def _blob(tensors: dict[str, Tensor], name: str) -> NDArray[np.uint8]:
-    """The compressed bytes of a column."""
-    if name not in tensors or tensors[name].dtype != torch.uint8 or tensors[name].dim() != 1:
-        raise Damaged(f"no column {name}")
-    return tensors[name].numpy()
-
-
-def deflate(array: NDArray[Any]) -> NDArray[np.uint8]:
-    """The compressed (zlib) bytes of an array [N] or [N, C], by channel, then by significance."""
-    flat = array.reshape(len(array), -1) if len(array) else np.zeros((0, 1), array.dtype)
-    raw = np.ascontiguousarray(flat).astype(array.dtype.newbyteorder("<"), copy=False).view(np.uint8).reshape(*flat.shape, array.itemsize)
-    return np.frombuffer(zlib.compress(np.ascontiguousarray(raw.transpose(1, 2, 0)).tobytes(), 6), np.uint8).copy()
-
-
-def inflate(blob: NDArray[np.uint8], size: int, exact: bool = True) -> NDArray[np.uint8]:
-    """The bytes that `deflate` compressed, in its order: `size` of them, or at most `size` unless
-    `exact`. Raises ValueError for others."""
-    machine = zlib.decompressobj()
-    data = machine.decompress(blob.data, size + 1)  # never allocates more than expected, whatever the file declares
-    if len(data) > size or not (machine.eof and (len(data) == size or not exact)):
-        raise ValueError(f"{len(data)} bytes where {size} are expected")
-    return np.frombuffer(data, np.uint8)
-
-
-# --- cells --------------------------------------------------------------------------------------------------------------------------------
-
-
-def encode_steps(keys: Keys) -> NDArray[np.uint8]:
-    """The bytes of sorted keys [N]: the step to each key in groups of 7 bits, low groups first; the
-    top bit says that more follow."""
-    steps = np.diff(keys, prepend=np.uint64(0))
-    groups = np.stack([(steps >> np.uint64(_GROUP * i)).astype(np.uint8) & 0x7F for i in range(_MAX_GROUPS)], axis=1)
-    more = np.stack([steps >> np.uint64(_GROUP * (i + 1)) != 0 for i in range(_MAX_GROUPS)], axis=1)
-    used = np.concatenate([np.ones((len(steps), 1), bool), more[:, :-1]], axis=1)
-    return np.where(more, groups | 0x80, groups).astype(np.uint8)[used]
-
-
-def decode_steps(data: NDArray[np.uint8]) -> Keys:
-    """The keys that `encode_steps` encoded. Raises ValueError for damaged bytes."""
-    if not len(data):
-        return np.zeros(0, np.uint64)
-    ends = np.flatnonzero(data < 0x80)
-    if not len(ends) or ends[-1] != len(data) - 1:
-        raise ValueError("a step is cut short")
-    starts = np.concatenate([[0], ends[:-1] + 1])
-    place = np.arange(len(data)) - np.repeat(starts, ends - starts + 1)
-    if place.max() >= _MAX_GROUPS:
-        raise ValueError("a step is too long")
-    parts = (data & 0x7F).astype(np.uint64) << (_GROUP * place).astype(np.uint64)
-    return np.cumsum(np.add.reduceat(parts, starts), dtype=np.uint64)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.numbers import FARTHEST, LARGEST, LARGEST_LOG, expect_range
+from scene_experts.files.anchors.precision import Precision
 from scene_experts.scene.anchors.mlp import Attribute
 
 Network = dict[str, Tensor]
@@ -37,10 +38,10 @@ class AnchorData:
     """The description (scene.json): everything that the tensors do not say. None for a result of
     another program."""
     cells: Tensor | None = None
-    """Lattice cells [N, 3] int64: position = cell * voxel + origin. None: on no known lattice, or
-    on several."""
+    """Lattice cells [N, 3] int64: position = cell * voxel + origin, or with levels of detail cell *
+    edges[level] + origin. None: on no known lattice."""
     voxel: float = 0.0
-    """Edge of a cell; 0: unknown."""
+    """Edge of a cell, of the finest with levels of detail; 0: unknown."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of cell (0, 0, 0)."""
     add_dist: tuple[Attribute, ...] = ()
@@ -49,6 +50,10 @@ class AnchorData:
     """Iterations trained; 0: unknown."""
     settings: dict[str, Any] = field(default_factory=dict)
     """cfg_args of a result folder."""
+    edges: tuple[float, ...] = ()
+    """Edge of a cell of each level of detail, coarse to fine; empty: one lattice."""
+    precision: Precision | None = None
+    """How precisely a compact file holds it; None: finely, without regard to pictures."""
 
     def checked(self) -> AnchorData:
         """This scene. Raises Damaged for values of anchors and networks that are not finite or that

@@ -97,7 +97,8 @@ def scene(run: OpenRun, contents: AnchorData, world: World) -> tuple[Scene, int]
     written from."""
     networks = by_attribute(contents.networks)
     check_networks(networks, "the file")
-    tensors = tensors_of(contents, networks, world, run.scene.traits.voxel)
+    levels = Levels.from_meta(run.scene.meta()["levels"]) if run.scene.traits.levels else None
+    tensors = tensors_of(contents, networks, world, run.scene.traits.voxel, levels)
     return restore_scene(run.config.train.scaled_scene(), tensors, run.scene.meta()).eval(), run.step
 
 

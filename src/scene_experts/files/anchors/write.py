@@ -23,6 +23,7 @@ from scene_experts.data.views import World
 from scene_experts.files.anchors import torchscript
 from scene_experts.files.anchors.data import FILE_NAMES, AnchorData, by_attribute
 from scene_experts.files.formats.ply import Columns, floats, numbered_columns, write_vertices
+from scene_experts.scene.anchors.levels import Levels
 from scene_experts.scene.anchors.mlp import ATTRIBUTES
 from scene_experts.scene.anchors.scene import AnchorScene
 from scene_experts.training.run_folder import OpenRun
@@ -59,16 +60,28 @@ def contents(run: OpenRun, world: World, about: dict[str, Any]) -> AnchorData:
         columns["slots"] = facts["slots"].cpu()
     if "interval" in facts:
         columns["interval"] = facts["interval"].cpu() / world.scale
+    edges: tuple[float, ...] = ()
+    origin = (-x, -y, -z)
     on_lattice = not run.scene.traits.levels and is_on_lattice(cells, xyz, scene.voxel)
+    if run.scene.traits.levels:
+        levels = Levels.from_meta(scene.meta()["levels"])
+        held = facts["level"].cpu()
+        rows = [(held == j).nonzero().squeeze(1) for j in range(levels.count)]
+        start = torch.tensor(levels.origin, dtype=torch.float64)
+        on_lattice = all(is_on_lattice(cells[own], xyz[own].double() - start, levels.size(j)) for j, own in enumerate(rows))
+        edges = tuple(levels.size(j) / world.scale for j in range(levels.count))
+        a, b, c = world.to_input(start).tolist()
+        origin = (a, b, c)
     return AnchorData(
         columns,
         networks(scene, world.scale),
         about,
         cells if on_lattice else None,
         scene.voxel / world.scale,
-        (-x, -y, -z),
+        origin,
         scene.config.add_dist,
         run.step,
+        edges=edges,
     )
 
 

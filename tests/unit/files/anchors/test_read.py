@@ -83,7 +83,7 @@ def test_a_published_result_draws_as_it_is(tmp_path, folder, cfg, depth):
     torch.testing.assert_close(found, wanted, rtol=0, atol=1e-4)
     assert opened.scene.voxel == pytest.approx(VOXEL, rel=1e-6)
     assert torch.equal(opened.scene.table.facts["cell"], scene.table.facts["cell"])
-    (written,) = export_run(out, "compact", measure=True)
+    (written,) = export_run(out, "compact", measure=True, quality=0.01)
     assert written.rows == len(scene.positions) and written.psnr["file"] == pytest.approx(written.psnr["run"], abs=0.1)
     capture.images.close()
 

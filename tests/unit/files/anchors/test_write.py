@@ -105,10 +105,13 @@ def test_the_description_says_experts_phases_and_the_world():
     assert set(single["phase"].values()) == {"single"} and "nowhere" not in json.dumps(single)
 
 
-def test_levels_have_columns_and_no_single_lattice():
+def test_levels_have_columns_and_a_lattice_each():
     run = run_in_memory("octree-gs")
     found, levels = contents(run), run.scene.select.lattices
-    assert found.cells is None
+    assert torch.equal(found.cells, run.scene.table.facts["cell"])
+    edges = torch.tensor(found.edges, dtype=torch.float64)[found.columns["level"]]
+    places = found.cells.double() * edges[:, None] + torch.tensor(found.origin, dtype=torch.float64)
+    torch.testing.assert_close(places.float(), found.columns["xyz"])
     assert found.columns["info"][:3].tolist() == pytest.approx([levels.edge / 2.5, levels.standard / 2.5, 0.0])
     assert torch.equal(found.columns["level"], run.scene.table.facts["level"])
     assert "level" in write.vertices(found) and "nx" not in write.vertices(found)

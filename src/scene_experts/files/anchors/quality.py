@@ -1,0 +1,179 @@
+"""Chooses how precisely a compact file holds a scene: by what the training views may lose, or by
+the size of the file. One number scales all steps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from scene_experts.core.errors import InputError
+from scene_experts.data.views import Capture, World
+from scene_experts.evaluate.metrics import psnr
+from scene_experts.files.anchors.data import AnchorData
+from scene_experts.files.anchors.read import scene as scene_of
+from scene_experts.files.anchors.rounding import rounded
+from scene_experts.files.anchors.sensitivity import MOST_VIEWS, evenly, keep, kept, measure
+from scene_experts.files.measure import Painter, Tell
+from scene_experts.files.options import Options
+from scene_experts.files.placed import place_cameras
+from scene_experts.files.scene_folder import origin_of
+from scene_experts.render import Rasterizer, as_trained, choose
+from scene_experts.scene import Scene
+from scene_experts.scene.anchors.scene import AnchorScene
+from scene_experts.training.run_folder import OpenRun
+
+VIEWS = 16  # that judge a precision
+START = -40.0  # first guess of log2 of the mean square error that every value adds
+ROUNDS = 10
+UNKNOWN_ERROR = 10**-3.2  # mean square error of pictures without photographs: that of 32 dB
+WORST_ERROR = 10**-2.6  # of a scene with 26 dB: what a worse one may lose is as if it had these
+MEGABYTE = 1_000_000
+
+
+@dataclass(frozen=True)
+class Judge:
+    """What a precision costs on the training views."""
+
+    run: OpenRun
+    world: World  # of the contents
+    capture: Capture
+    rasterize: Rasterizer | None
+
+    @cached_property
+    def views(self) -> list[int]:
+        """The training views that judge."""
+        views = [i for i in self.capture.train if not self.has_photographs or _shows(self.capture, i)]
+        return evenly(views, VIEWS)
+
+    @property
+    def has_photographs(self) -> bool:
+        """Whether the loss is that against photographs. Without them it is estimated from the
+        difference between the pictures, as if the run had 32 dB."""
+        return len(self.capture.images) > 0
+
+    def _painter(self, scene: Scene, step: int) -> Painter:
+        return Painter.of(scene, step, self.rasterize, self.run.config.train.antialias)
+
+    @cached_property
+    @torch.no_grad()
+    def _before(self) -> list[tuple[Tensor, float]]:
+        """By view: the run's picture as bytes, and its mean square error."""
+        painter, background, out = self._painter(self.run.scene, self.run.step), torch.tensor(self.capture.background), []
+        for index in self.views:
+            image = painter.picture_8bit(self.capture.views[index].camera, background)
+            out.append(((image * 255).round().to(torch.uint8), self._error(index, image)))
+        return out
+
+    def _error(self, index: int, image: Tensor) -> float:
+        if not self.has_photographs:
+            return UNKNOWN_ERROR
+        frame = self.capture.frame(index)
+        return 10 ** (-0.1 * psnr(image, frame.rgb.float() / 255, frame.mask))
+
+    @torch.no_grad()
+    def loss(self, contents: AnchorData) -> float:
+        """What contents lose against the run, dB: the mean over the views. Of a scene whose errors a
+        rounding happens to mend, it is what the difference between the pictures would cost."""
+        painter, total = self._painter(*scene_of(self.run, contents, self.world)), 0.0
+        background = torch.tensor(self.capture.background)
+        for index, (own, error) in zip(self.views, self._before):
+            image = painter.picture_8bit(self.capture.views[index].camera, background)
+            away = float((image - own.float() / 255).double().square().mean())
+            after = max(error + away, self._error(index, image) if self.has_photographs else 0.0)
+            total += max(10 * math.log10(after / error), 10 * math.log10(1 + away / WORST_ERROR))
+        return total / len(self.views)
+
+
+def _shows(capture: Capture, index: int) -> bool:
+    mask = capture.frame(index).mask
+    return mask is None or bool(mask.any())
+
+
+def search(value: Callable[[float], float], wanted: float, start: float, slope: float, close: float) -> float | None:
+    """A place u where an increasing function is at most `wanted` and at least `close` times it, or
+    the largest place with at most `wanted` that was tried; None: there is none.
+
+    start: the first place. slope: about how much log2 of the function rises with u.
+    """
+    low: float | None = None
+    high: float | None = None
+    at = start
+    for _ in range(ROUNDS):
+        found = value(at)
+        if found <= wanted:
+            low = at if low is None else max(low, at)
+            if found >= close * wanted:
+                break
+        else:
+            high = at if high is None else min(high, at)
+        guess = at + max(-8.0, min(8.0, math.log2(max(0.5 * (1 + close) * wanted, 1e-12) / max(found, wanted / 64, 1e-12)) / slope))
+        if low is not None and high is not None and not low + 0.1 * (high - low) < guess < high - 0.1 * (high - low):
+            guess = 0.5 * (low + high)
+        if low is not None and high is not None and high - low < 0.02:
+            break
+        at = guess
+    return low
+
+
+@contextmanager
+def judging_capture(run: OpenRun, world: World, capture: Capture | None) -> Iterator[Capture]:
+    """The capture, or the run's cameras without photographs where it is gone or has no training
+    views."""
+    if capture is not None and capture.train:
+        yield capture
+        return
+    trained = run.scene.positions.detach().cpu().double()
+    origin = origin_of(run, world)
+    yield place_cameras(run.path, trained, world, origin, run.config.data.background)
+
+
+def choose_precision(
+    run: OpenRun,
+    contents: AnchorData,
+    world: World,
+    options: Options,
+    capture: Capture | None,
+    rasterize: Rasterizer | None,
+    tell: Tell,
+    size: Callable[[AnchorData], int],
+) -> tuple[AnchorData, list[str]]:
+    """Contents with the precision that the options ask for, and a sentence about it.
+
+    options: `quality` or `target_mb`. capture: whose training views judge; None: it is gone, and
+    the run's cameras judge. world: of the run, in the frame of the capture. size: bytes of a file.
+    Raises InputError for a size that no precision reaches.
+    """
+    if not len(contents.columns["xyz"]):
+        return contents, []
+    with judging_capture(run, world, capture) as views:
+        precision = kept(run)
+        if precision is None:
+            cameras = [views.views[i].camera for i in evenly(views.train, MOST_VIEWS)]
+            draws = as_trained(rasterize or choose("auto", "cpu"), run.config.train.antialias)
+            precision = measure(cast(AnchorScene, run.scene), run.step, cameras, torch.tensor(views.background), draws, tell)
+            keep(run, precision)
+        unit = precision
+        judge = Judge(run, world.seen_from(origin_of(run, world)), views, rasterize)
+
+        def loss(at: float) -> float:
+            return judge.loss(rounded(contents, unit.at(2.0**at)))
+
+        if options.target_mb:
+            wanted = options.target_mb * MEGABYTE
+            place = search(lambda u: size(replace(contents, precision=unit.at(2.0**-u))), wanted, -START - 2, 0.12, 0.98)
+            if place is None:
+                raise InputError(f"expected a --target-mb that this scene fits into, found {options.target_mb:g}; give a larger number")
+            at = -place
+        else:
+            found = search(loss, options.quality, START, 1.0, 0.85)
+            at = START - 30 if found is None else found
+        lost, against = loss(at), "" if judge.has_photographs else " (estimated, without photographs)"
+        line = f"{len(judge.views)} training views lose {lost:.3f} dB{against}"
+        return replace(contents, precision=unit.at(2.0**at)), [line]

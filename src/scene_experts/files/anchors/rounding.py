@@ -1,0 +1,152 @@
+"""Scenes of anchors as whole numbers and back: what a compact file holds of them.
+
+`round_scene` and `restore` are each other's inverse up to the rounding that a `Precision` states.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from scene_experts.core.errors import InputError
+from scene_experts.core.reading.budget import Damaged
+from scene_experts.files.anchors.data import AnchorData
+from scene_experts.files.anchors.precision import ROUNDED, Precision, from_spread, is_exact, rows_of
+from scene_experts.files.codec.groups import CLASS, EXTRA, FEATURE, OFFSETS, SCALING, SLOTS
+from scene_experts.files.codec.numbers import Rounded
+from scene_experts.files.codec.reference import Ints
+
+MOST_SYMBOL = 1 << 30
+FURTHER = {"interval": 0.02, "extra_level": 0.008}
+"""Columns of one value, with their steps: the logarithm of an interval, and the share of a
+level."""
+_LEAST_INTERVAL = 1e-30
+
+
+@dataclass(frozen=True)
+class WholeScene:
+    """A scene of anchors as whole numbers, in the order of its rows."""
+
+    values: dict[str, Ints]
+    """By group of the codec: [C, N] int32."""
+    steps: dict[str, list[float]]
+    """By group, of its channels: a value is number * step * 2^class, in the group of further
+    columns without a class."""
+    extra: list[str]
+    """The names of the further columns."""
+    networks: dict[str, Rounded]
+    exact: dict[str, NDArray[np.float32]]
+    """Tensors that are held as they are."""
+
+
+def round_scene(data: AnchorData) -> WholeScene:
+    """The whole numbers of a scene. Raises InputError for values that are not finite or are too
+    large for their steps."""
+    p, c, n = data.precision or from_spread(data.columns, data.networks), data.columns, len(data.columns["xyz"])
+    classes = p.classes.cpu().numpy().astype(np.int32)
+    scale = 2.0 ** classes.astype(np.float64)
+    parts: dict[str, Ints] = {}
+    for name in ROUNDED:
+        value = c[name].detach().cpu().double().reshape(n, math.prod(c[name].shape[1:])).numpy()
+        if not np.isfinite(value).all():
+            raise InputError(f"expected finite {name}, found others in {(~np.isfinite(value)).any(1).sum():,} anchors; train again")
+        parts[name] = _whole(value.T / p.steps[name].double().numpy()[:, None] / scale, name)
+    values = {CLASS: classes[None], FEATURE: parts["feature"], SCALING: parts["log_scaling"], OFFSETS: parts["offsets"]}
+    extra = [name for name in FURTHER if name in c]
+    if extra:
+        further = {name: c[name].detach().cpu().double().numpy() for name in extra}
+        further |= {"interval": np.log(np.maximum(further["interval"], _LEAST_INTERVAL))} if "interval" in extra else {}
+        values[EXTRA] = np.stack([_whole(further[name] / FURTHER[name], name) for name in extra])
+    if "slots" in c:
+        live = c["slots"].cpu().numpy().T
+        values[SLOTS] = np.ascontiguousarray(live, np.int32)
+        values[OFFSETS] = values[OFFSETS] * np.repeat(live, 3, 0)
+    steps = {FEATURE: p.steps["feature"].tolist(), SCALING: p.steps["log_scaling"].tolist(), OFFSETS: p.steps["offsets"].tolist()}
+    steps |= {EXTRA: [FURTHER[name] for name in extra]} if extra else {}
+    networks, exact = {}, {}
+    for name, value in data.networks.items():
+        value = value.detach().cpu().float()
+        if not value.isfinite().all():
+            raise InputError(f"expected finite weights of {name}, found others; train again")
+        if is_exact(name):
+            exact[name] = value.numpy()
+        else:
+            networks[name] = _round_network(name, value, p.networks[name], _columns(data).get(name))
+    return WholeScene(values, {name: [float(f"{s:.4g}") for s in found] for name, found in steps.items()}, extra, networks, exact)
+
+
+def _whole(value: NDArray[np.float64], what: str) -> Ints:
+    found = np.rint(value)
+    if np.abs(found).max(initial=0) > MOST_SYMBOL:
+        raise InputError(f"expected {what} below 2^30 of its steps for a compact file, found larger values; use --format anchors")
+    return found.astype(np.int32)
+
+
+def _columns(data: AnchorData) -> dict[str, tuple[int, int]]:
+    """By tensor of a network: the column that sees the distance, and the whole exponent of two by
+    which the unit of files makes it larger than that of the training."""
+    scale = float(((data.about or {}).get("world") or {}).get("scale", 1.0))
+    exponent = round(math.log2(scale)) if 1e-15 <= scale <= 1e15 else 0
+    codes = data.networks["appearance.table"].shape[1] if "appearance.table" in data.networks else 0
+    out = {f"{a}.experts.w1": (-1 - (codes if a == "color" else 0), exponent) for a in data.add_dist}
+    return out | ({"feature_bank.experts.w1": (3, exponent)} if "feature_bank.experts.w1" in data.networks else {})
+
+
+def _round_network(name: str, value: Tensor, exponents: Tensor, column: tuple[int, int] | None) -> Rounded:
+    rows = rows_of(name, value.double()).clone()
+    if column is not None:
+        rows[:, :, column[0]] *= 2.0 ** -column[1]
+    whole = exponents.double().round().clamp(-120, 120)
+    found = torch.round(rows / 2.0 ** (whole[:, None] / 2))
+    coarser = torch.log2(found.abs().amax((0, 2)).clamp_min(1) / (1 << 20)).clamp_min(0).ceil() * 2  # numbers stay below 2^20
+    whole = (whole + coarser).clamp(-120, 120)
+    found = torch.round(rows / 2.0 ** (whole[:, None] / 2))
+    if float(found.abs().max() if found.numel() else 0) > MOST_SYMBOL:
+        raise InputError(f"expected weights of {name} below 2^80, found larger ones; train again")
+    return Rounded(found.to(torch.int32).numpy(), whole.to(torch.int32).numpy())
+
+
+def restore(whole: WholeScene, data: AnchorData, shapes: Mapping[str, tuple[int, ...]]) -> AnchorData:
+    """The scene of whole numbers. data: everything else of it; its columns have at least xyz.
+    shapes: of the networks' tensors. Raises Damaged for numbers that are no scene."""
+    v, n = whole.values, len(data.columns["xyz"])
+    factor = np.float32(2.0) ** v[CLASS][0]
+    floats = {}
+    for name, steps in whole.steps.items():
+        value = v[name].astype(np.float32)
+        value *= np.array(steps, np.float32)[:, None]
+        value *= np.float32(1) if name == EXTRA else factor.astype(np.float32)
+        floats[name] = torch.from_numpy(np.ascontiguousarray(value.T))
+    columns = {"feature": floats[FEATURE], "log_scaling": floats[SCALING], "offsets": floats[OFFSETS].reshape(n, len(v[OFFSETS]) // 3, 3)}
+    for i, name in enumerate(whole.extra):
+        value = floats[EXTRA][:, i].clone()
+        columns[name] = value.clamp(-69.0, 34.0).exp() if name == "interval" else value
+    if SLOTS in v:
+        columns["slots"] = torch.from_numpy((v[SLOTS] != 0).T.copy())
+    networks: dict[str, Tensor] = {}
+    for name, shape in shapes.items():
+        if name in whole.exact:
+            networks[name] = torch.from_numpy(whole.exact[name].copy()).reshape(shape)
+            continue
+        value = torch.from_numpy(whole.networks[name].floats())
+        networks[name] = value.reshape(shape)
+    out = replace(data, columns={**data.columns, **columns}, networks=networks)
+    for name, (column, exponent) in _columns(out).items():
+        if name not in networks or networks[name].dim() != 3 or not -networks[name].shape[2] <= column < networks[name].shape[2]:
+            raise Damaged(f"networks without the column of the distance in {name}")
+        networks[name][:, :, column] *= 2.0**exponent
+    return out
+
+
+def rounded(data: AnchorData, precision: Precision) -> AnchorData:
+    """The scene as a file of this precision gives it back, in the order of its rows."""
+    whole = round_scene(replace(data, precision=precision))
+    plain = {name: value for name, value in data.columns.items() if name not in (*ROUNDED, *FURTHER, "slots")}
+    shapes = {name: tuple(value.shape) for name, value in data.networks.items()}
+    return replace(restore(whole, replace(data, columns=plain), shapes), precision=precision)

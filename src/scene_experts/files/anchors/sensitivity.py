@@ -1,0 +1,109 @@
+"""How much the pictures of a trained scene depend on each of its values.
+
+The sensitivity of a value is the mean over pixels and channels of the squared derivative of the
+picture. One backward pass for each training view estimates it for all values: with a random sign
+for each pixel and channel, the square of the gradient has that sum as its mean. Only cameras are
+needed, no photographs.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scene_experts.core.checkpoint import read_tensors, write_tensors
+from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.types import Camera, Mode
+from scene_experts.files.anchors.data import FILE_NAMES
+from scene_experts.files.anchors.precision import ROUNDED, Precision, from_sensitivity, is_exact
+from scene_experts.files.measure import Tell
+from scene_experts.render import Rasterizer
+from scene_experts.scene.anchors.scene import AnchorScene
+from scene_experts.training.run_folder import OpenRun
+
+FILE = "precision.safetensors"
+"""In a run folder: the steps of an error of 1 at the newest export."""
+KIND, VERSION = "precision", 1
+MOST_VIEWS = 48  # evenly chosen
+
+
+def evenly(items: Sequence[int], most: int) -> list[int]:
+    """At most `most` items, evenly chosen."""
+    every = max(1, -(-len(items) // most))
+    return list(items[::every])
+
+
+def measure(scene: AnchorScene, step: int, cameras: Sequence[Camera], background: Tensor, rasterize: Rasterizer, tell: Tell) -> Precision:
+    """The steps of an error of 1 of a scene on the CPU, from its pictures at `cameras` over
+    `background` [3]."""
+    named = {f"params.{name}": scene.table.params[name] for name in ROUNDED}
+    for name, value in scene.network_tensors().items():
+        part, _, rest = name.partition(".")
+        named[f"{'feature_bank' if part == 'mix' else part}.{FILE_NAMES.get(rest, rest)}"] = value
+    values = {name: value for name, value in named.items() if not is_exact(name)}
+    before = [value.requires_grad for value in values.values()]
+    totals = {name: torch.zeros_like(value) for name, value in values.items()}
+    generator, pixels = torch.Generator().manual_seed(0), 0
+    try:
+        for value in values.values():
+            value.requires_grad_(True)
+        for i, camera in enumerate(cameras):
+            decoded = scene(camera, step, Mode.DRAW, rasterize.visible)
+            image = rasterize(decoded.gaussians, camera, background).image
+            signs = torch.randint(0, 2, image.shape, generator=generator).to(image.dtype) * 2 - 1
+            if image.requires_grad:
+                found = torch.autograd.grad((image * signs).sum(), list(values.values()), allow_unused=True)
+                for total, gradient in zip(totals.values(), found):
+                    if gradient is not None:
+                        total += gradient.square()
+            pixels += image.numel()
+            tell("measuring what each value does to the pictures", i + 1, len(cameras))
+    finally:
+        for value, wanted in zip(values.values(), before):
+            value.requires_grad_(wanted)
+    means = {name: (total / max(pixels, 1)).nan_to_num(0, 0, 0) for name, total in totals.items()}
+    columns = {name: means.pop(f"params.{name}") for name in ROUNDED}
+    return from_sensitivity(columns, means)
+
+
+def fingerprint(scene: AnchorScene) -> int:
+    """A checksum of the values that a precision belongs to."""
+    found = 0
+    for value in (*(scene.table.params[name] for name in ROUNDED), *scene.network_tensors().values()):
+        found = zlib.crc32(np.ascontiguousarray(value.detach().cpu().numpy()).tobytes(), found)
+    return found
+
+
+def kept(run: OpenRun) -> Precision | None:
+    """The precision in a run folder, if it is that of the scene; None without."""
+    path = run.path / FILE
+    if run.lone is not None or not path.is_file():
+        return None
+    try:
+        tensors, meta = read_tensors(path, KIND, VERSION)
+    except InputError:
+        return None
+    scene = cast(AnchorScene, run.scene)
+    if meta.get("scene") != fingerprint(scene):
+        return None
+    steps = {name: tensors[f"steps.{name}"] for name in ROUNDED}
+    networks = {name.removeprefix("network."): value for name, value in tensors.items() if name.startswith("network.")}
+    return Precision(steps, tensors["classes"].long(), networks)
+
+
+def keep(run: OpenRun, precision: Precision) -> None:
+    """Write a precision into the run folder, where that is possible."""
+    if run.lone is not None or not Path(run.path).is_dir():
+        return
+    tensors = {f"steps.{name}": value for name, value in precision.steps.items()} | {"classes": precision.classes.to(torch.int8)}
+    tensors |= {f"network.{name}": value for name, value in precision.networks.items()}
+    try:
+        write_tensors(run.path / FILE, tensors, KIND, VERSION, {"scene": fingerprint(cast(AnchorScene, run.scene)), "step": run.step})
+    except RunError:  # a folder that may not be written to: the next export measures again
+        return

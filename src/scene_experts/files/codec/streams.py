@@ -1,0 +1,186 @@
+"""Streams of whole numbers: coded by the compiled library, or by `reference` where there is none."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_experts.core.reading.budget import Damaged
+from scene_experts.files.codec import reference
+from scene_experts.files.codec.reference import Ints
+from scene_experts.native import api
+from scene_experts.native import library as native
+
+MOST_INPUTS = 4096  # of a context, so that no sum exceeds 32 bits
+_MOST_OPERATIONS = 6  # of a symbol
+
+
+def _at(array: NDArray[Any]) -> int:
+    assert array.flags.c_contiguous
+    return array.__array_interface__["data"][0]  # ten times as fast as array.ctypes.data
+
+
+class SymbolWriter:
+    """Collects symbols and bits, and packs them into bytes. `slow`: with the reference."""
+
+    def __init__(self, slow: bool = False) -> None:
+        self._library = None if slow else native.load()
+        self._parts: list[NDArray[np.uint32]] = []
+
+    def symbols(self, values: Ints, mean: Ints, scale: Ints) -> None:
+        """Append values [n], expected near mean [n] (1/8 of a step) with a spread of 2^(scale / 8 -
+        4) steps."""
+        if self._library is None:
+            self._parts.append(reference.code_symbols(values, mean, scale))
+            return
+        values, mean, scale = (np.ascontiguousarray(a, np.int32) for a in (values, mean, scale))
+        room = np.empty(_MOST_OPERATIONS * len(values), np.uint32)
+        used = self._library.se_code_symbols(_at(values), _at(mean), _at(scale), len(values), _at(room))
+        self._parts.append(room[:used].copy())
+
+    def bits(self, bits: NDArray[np.uint8], odds: Ints) -> None:
+        """Append bits [n] with odds [n] of a one: 2^((odds - 64) / 8)."""
+        if self._library is None:
+            self._parts.append(reference.code_bits(bits, odds))
+            return
+        bits, odds = np.ascontiguousarray(bits, np.uint8), np.ascontiguousarray(odds, np.int32)
+        room = np.empty(len(bits), np.uint32)
+        self._library.se_code_bits(_at(bits), _at(odds), len(bits), _at(room))
+        self._parts.append(room)
+
+    def cells(self, keys: NDArray[np.int64], depth: int) -> None:
+        """Append distinct ascending Morton keys [n] of 3 depth bits."""
+        if self._library is None:
+            self._parts.append(reference.code_cells(keys, depth))
+            return
+        keys = np.ascontiguousarray(keys, np.int64)
+        room, used = np.empty(48 * len(keys) + 64, np.uint32), 0
+        for _ in range(2):  # few scenes need more room
+            used = self._library.se_code_cells(_at(keys), len(keys), depth, _at(room), len(room))
+            native.check(int(used < 0), "coding the positions")
+            if used <= len(room):
+                break
+            room = np.empty(used, np.uint32)
+        self._parts.append(room[:used].copy())
+
+    @property
+    def ideal_bits(self) -> float:
+        """The information of the shares that were taken, in bits."""
+        return float(sum((reference.BITS - np.log2(part & 0xFFFF)).sum() for part in self._parts))
+
+    def pack(self) -> bytes:
+        """The bytes of everything appended: words of 16 bits, low byte first."""
+        operations = np.concatenate([*self._parts, np.zeros(0, np.uint32)])
+        if self._library is None:
+            return reference.pack(operations).astype("<u2").tobytes()
+        room = np.empty(len(operations) + 2 * reference.LANES, np.uint16)
+        used = self._library.se_code_pack(_at(operations), len(operations), _at(room))
+        return room[:used].astype("<u2").tobytes()
+
+
+class SymbolReader:
+    """Reads what a `SymbolWriter` packed, in the same order. Its methods raise Damaged for bytes
+    that fit no symbols."""
+
+    def __init__(self, data: bytes, slow: bool = False) -> None:
+        if len(data) % 2:
+            raise Damaged("a stream of half a word")
+        self._words = np.frombuffer(data, "<u2").astype(np.uint16)
+        self._library = None if slow else native.load()
+        self._slow = reference.WordReader(self._words) if self._library is None else None
+        if self._library is not None:
+            self._state = api.SeCodeReader(_at(self._words), len(self._words))
+            self._check(self._library.se_code_start(ctypes.byref(self._state)))
+
+    def _check(self, status: int) -> None:
+        if status == 1:
+            native.check(status, "reading a compact file")
+        if status:
+            raise Damaged("a stream that does not fit its contents")
+
+    def symbols(self, mean: Ints, scale: Ints) -> Ints:
+        """The values [n] that were coded with the same mean [n] and scale [n]."""
+        if self._slow is not None:
+            return self._slow.symbols(mean, scale)
+        mean, scale = np.ascontiguousarray(mean, np.int32), np.ascontiguousarray(scale, np.int32)
+        out = np.zeros(len(mean), np.int32)
+        self._check(self._library.se_code_read(ctypes.byref(self._state), _at(mean), _at(scale), len(mean), _at(out)))  # type: ignore[union-attr]
+        return out
+
+    def bits(self, odds: Ints) -> NDArray[np.uint8]:
+        """The bits [n] that were coded with the same odds [n]."""
+        if self._slow is not None:
+            return self._slow.bits(odds)
+        odds = np.ascontiguousarray(odds, np.int32)
+        out = np.zeros(len(odds), np.uint8)
+        self._check(self._library.se_code_read_bits(ctypes.byref(self._state), _at(odds), len(odds), _at(out)))  # type: ignore[union-attr]
+        return out
+
+    def cells(self, depth: int, count: int) -> NDArray[np.int64]:
+        """The Morton keys [count] that were coded with the same depth, at most 21."""
+        if self._slow is not None:
+            return reference.read_cells(self._slow, depth, count)
+        out = np.zeros(count, np.int64)
+        self._check(self._library.se_code_read_cells(ctypes.byref(self._state), depth, count, _at(out)))  # type: ignore[union-attr]
+        return out
+
+    def finish(self) -> None:
+        """Raises Damaged unless the bytes end here."""
+        done = (
+            self._slow.is_done
+            if self._slow is not None
+            else self._state.at == len(self._words) and set(self._state.state) == {reference.FLOOR}
+        )
+        if not done:
+            raise Damaged("a stream that is longer than its contents")
+
+
+def predict(
+    inputs: NDArray[np.int16], used: int, weights: NDArray[np.int8], numbers: Sequence[int], classes: NDArray[np.int8], slow: bool = False
+) -> tuple[Ints, Ints]:
+    """`reference.predict` with the first `used` rows of inputs [at least D, n]; weights [2, D]."""
+    library = None if slow else native.load()
+    if library is None:
+        return reference.predict(inputs[:used], weights, numbers, classes)
+    n = inputs.shape[1]
+    mean, scale, four = np.empty(n, np.int32), np.empty(n, np.int32), np.array(numbers, np.int32)
+    weights, classes = np.ascontiguousarray(weights, np.int8), np.ascontiguousarray(classes, np.int8)
+    assert weights.shape == (2, used) and len(classes) == n
+    library.se_code_predict(_at(inputs), n, _at(weights), _at(four), used, _at(classes), n, _at(mean), _at(scale))
+    return mean, scale
+
+
+def as_inputs(values: Ints, classes: NDArray[np.int8], factor: int, offset: int, slow: bool = False) -> NDArray[np.int16]:
+    """`reference.as_inputs`."""
+    library = None if slow else native.load()
+    if library is None:
+        return reference.as_inputs(values, classes, factor, offset)
+    values, classes = np.ascontiguousarray(values, np.int32), np.ascontiguousarray(classes, np.int8)
+    out = np.empty(len(values), np.int16)
+    library.se_code_inputs(_at(values), _at(classes), len(values), factor, offset, _at(out))
+    return out
+
+
+def blend(columns: NDArray[np.int16], parents: Ints, weights: Ints, slow: bool = False) -> NDArray[np.int16]:
+    """`reference.blend`."""
+    library = None if slow else native.load()
+    if library is None:
+        return reference.blend(columns, parents, weights)
+    out = np.empty((len(columns), len(parents)), np.int16)
+    library.se_code_blend(_at(columns), columns.shape[1], len(columns), _at(parents), _at(weights), len(parents), _at(out))
+    return out
+
+
+def find_parents(cells: Ints, rows: Ints, coarse: Ints, slow: bool = False) -> tuple[Ints, Ints]:
+    """`reference.find_parents`."""
+    library = None if slow else native.load()
+    if library is None:
+        return reference.find_parents(cells, rows, coarse)
+    cells, rows, coarse = (np.ascontiguousarray(a, np.int32) for a in (cells, rows, coarse))
+    parents, weights = np.empty((len(rows), 4), np.int32), np.empty((len(rows), 4), np.int32)
+    library.se_code_parents(_at(cells), _at(rows), len(rows), _at(coarse), len(coarse), _at(parents), _at(weights))
+    return parents, weights

@@ -1,0 +1,63 @@
+"""The search for a precision, and files of a wanted loss or size."""
+
+import math
+
+import pytest
+import torch
+
+from scene_experts.core.errors import InputError
+from scene_experts.core.plain import to_json
+from scene_experts.data.views import World
+from scene_experts.files import placed
+from scene_experts.files.anchors import compact, quality
+from scene_experts.files.anchors.quality import search
+from scene_experts.files.anchors.write import contents, describe
+from scene_experts.files.codec import fit
+from scene_experts.files.export import export
+from scene_experts.files.lone import open_scene
+from scene_experts.files.options import Options
+from support.files import run_in_memory
+
+
+@pytest.mark.parametrize("start", [-60.0, -40.0, 10.0])
+def test_the_search_ends_near_the_wanted_value(start):
+    tried = []
+
+    def value(u):
+        tried.append(u)
+        return 0.3 * 2.0 ** (1.3 * (u + 31))
+
+    found = search(value, 0.1, start, 1.0, 0.85)
+    assert 0.085 <= value(found) <= 0.1 and len(tried) <= quality.ROUNDS + 1
+
+
+def test_steps_and_functions_without_a_place():
+    assert search(lambda u: 5.0, 0.1, 0.0, 1.0, 0.85) is None
+    found = search(lambda u: 0.0 if u < 3 else 1.0, 0.5, 0.0, 1.0, 0.85)
+    assert 2 < found < 3
+    assert math.isfinite(search(lambda u: -1.0, 0.5, 0.0, 1.0, 0.85))
+
+
+@pytest.mark.slow
+def test_a_file_without_photographs_gets_a_wanted_loss_or_size(tmp_path, monkeypatch):
+    monkeypatch.setattr(placed, "SIZE", (80, 60))
+    monkeypatch.setattr(quality, "VIEWS", 3)
+    monkeypatch.setattr(fit, "STEPS", 20)
+    run = run_in_memory("scaffold-gs")
+    with torch.no_grad():
+        for name, value in run.scene.table.params.items():
+            value += 0.2 * torch.randn(value.shape, generator=torch.Generator().manual_seed(len(name)))
+    about = describe(run, World()) | {"train": to_json(run.config.train)}
+    compact.write(tmp_path / "a.compact", contents(run, World(), about), {})
+    opened = open_scene(tmp_path / "a.compact")
+    sizes = []
+    for loss in (0.01, 1.0):
+        (written,) = export(opened, "compact", tmp_path / f"{loss}.compact", Options(measure=False, quality=loss))
+        sizes.append(written.bytes)
+        assert "estimated, without photographs" in written.lines[-1]
+    assert sizes[1] < 0.9 * sizes[0]
+    wanted = 0.5 * sum(sizes) / 1e6
+    (written,) = export(opened, "compact", tmp_path / "b.compact", Options(measure=False, target_mb=wanted))
+    assert written.bytes <= wanted * 1e6 and written.bytes > 0.9 * wanted * 1e6
+    with pytest.raises(InputError, match="--target-mb"):
+        export(opened, "compact", tmp_path / "c.compact", Options(measure=False, target_mb=0.0001))
