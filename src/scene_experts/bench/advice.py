@@ -26,7 +26,6 @@ SIDES = ((0, 7000), (1200, 7000), (800, 7000), (800, 4000), (600, 4000), (600, 3
 # 5.7, 7.6 and 15.1 times the picture below. The line is near the first and the last, and above the
 # others.
 FEW, FEW_ITERATIONS = 30, 4000
-FEW_FOR_EXPERTS = 46
 BASE, PER_MEGAPIXEL = 4.5, 9.8
 SERIAL = 0.15  # share of an iteration that one thread does
 
@@ -79,12 +78,6 @@ def estimate_minutes(width: int, height: int, iterations: int, picture: float, t
     """Minutes of a training. picture: see `measure_picture`."""
     gain = 1 / (SERIAL + (1 - SERIAL) / threads)
     return iterations * picture * (BASE + PER_MEGAPIXEL * width * height / 1e6) / gain / 60
-
-
-def choose_recipe(views: int) -> str:
-    """Return the recipe for this number of photographs: with fewer than FEW_FOR_EXPERTS,
-    `scene-experts` gives softer pictures than `scaffold-gs`."""
-    return "scaffold-gs" if views < FEW_FOR_EXPERTS else "scene-experts"
 
 
 def suggest(width: int, height: int, views: int, picture: float | None = None, limit: float | None = None) -> Advice:

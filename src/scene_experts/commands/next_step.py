@@ -15,8 +15,9 @@ def propose_training(data: Data, width: int, height: int, views: int) -> str:
     The resolution is the one that is estimated, not that of `data`.
     """
     from scene_experts.api.command_line import changes, words_of
-    from scene_experts.bench.advice import choose_recipe, suggest
+    from scene_experts.bench.advice import suggest
     from scene_experts.data.fetch.catalog import defaults_of
+    from scene_experts.training.recipes import choose_recipe
 
     plain = Data(data.path, resolution=data.resolution, normalise=defaults_of(data.path).normalise)
     read = [word for place, value in changes(plain, data) or [] for word in words_of(place, value)]

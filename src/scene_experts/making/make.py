@@ -13,7 +13,7 @@ from scene_experts.api.capture import Capture, load_capture
 from scene_experts.api.recipe import Recipe, recipe
 from scene_experts.api.run import Run
 from scene_experts.api.trainer import Trainer
-from scene_experts.bench.advice import LIMIT, choose_recipe
+from scene_experts.bench.advice import LIMIT
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.progress import Progress
 from scene_experts.data.readers import is_capture
@@ -24,6 +24,7 @@ from scene_experts.sfm.options import SfmOptions
 from scene_experts.sfm.reconstruct import reconstruct
 from scene_experts.training import run_folder
 from scene_experts.training.events import Stepped
+from scene_experts.training.recipes import choose_recipe
 
 CAPTURE, RUN, PAGE = "capture", "run", "scene.html"
 RECENT = 200  # iterations whose time counts as that of one at the end
@@ -155,7 +156,8 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
         return TrainingPlan(place, split, (0, 0), capture, begun.train, begun=True)
     whole = load_capture(place, split=split)
     lens = whole.cameras[0]
-    plan = TrainingPlan(place, split, (lens.width, lens.height), whole, recipe("scaffold-gs")).fit(budget.for_training(scores))
+    first = TrainingPlan(place, split, (lens.width, lens.height), whole, recipe(choose_recipe(len(whole.train_cameras))))
+    plan = first.fit(budget.for_training(scores))
     held = f", {len(whole.test_cameras)} held out" if scores else ""
     about = "" if plan.minutes is None else f", about {max(1, round(plan.minutes))} min if the machine is not busy"
     say(f"training: {plan.recipe.recipe}, {plan.recipe.iterations:,} iterations on {len(whole.train_cameras)} photographs{held}{about}")

@@ -31,6 +31,7 @@ from scene_experts.training.losses import Weights
 from scene_experts.training.recipe_book import Recipe, RecipeBook
 
 EXPERTS = Experts(num=5, top_k=2, warmup=1500)
+FEW_FOR_EXPERTS = 46
 
 scaffold_gs: Train = Train(recipe="scaffold-gs", scene=Anchors(decoder=Plain()), loss=Weights(scale=0.01))
 moe_gs: Train = replace(
@@ -149,3 +150,9 @@ OWN: dict[str, Recipe] = {
 RECIPES = RecipeBook(OWN)
 """All recipes by name: a one-sentence description and the value of each."""
 load_with(RECIPES.load)
+
+
+def choose_recipe(views: int) -> str:
+    """Return the recipe for this number of photographs: with fewer than FEW_FOR_EXPERTS,
+    `scene-experts` gives softer pictures than `scaffold-gs`."""
+    return "scaffold-gs" if views < FEW_FOR_EXPERTS else "scene-experts"

@@ -12,7 +12,7 @@ from scene_experts.core.parts import Part, find, names_of
 from scene_experts.core.plain import lean
 from scene_experts.scene.anchors.experts import Experts
 from scene_experts.training.config import Train
-from scene_experts.training.recipes import RECIPES
+from scene_experts.training.recipes import RECIPES, choose_recipe
 from support.golden import recorded
 
 SOURCE = Path(scene_experts.__file__).parent
@@ -61,7 +61,6 @@ NAMED = {
     "bench/step.py",
     "commands/train.py",
     "commands/blocks.py",
-    "commands/next_step.py",
 }
 
 
@@ -75,3 +74,7 @@ def test_no_recipe_name_steers_code_elsewhere(path):
     else:
         found = [n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and n.value in names]
     assert not found
+
+
+def test_few_photographs_get_the_recipe_with_the_sharper_pictures():
+    assert choose_recipe(45) == "scaffold-gs" and choose_recipe(46) == "scene-experts"
