@@ -15,6 +15,7 @@ from scene_experts.api.run import Run
 from scene_experts.api.trainer import Trainer
 from scene_experts.bench.advice import LIMIT
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.io import read_json, write_json
 from scene_experts.core.progress import Progress
 from scene_experts.data.readers import is_capture
 from scene_experts.files.export import export_several
@@ -26,7 +27,7 @@ from scene_experts.training import run_folder
 from scene_experts.training.events import Stepped
 from scene_experts.training.recipes import choose_recipe
 
-CAPTURE, RUN, PAGE = "capture", "run", "scene.html"
+CAPTURE, RUN, PAGE, SOURCE = "capture", "run", "scene.html", "source.json"
 RECENT = 200  # iterations whose time counts as that of one at the end
 PER_VIEW = 0.2  # seconds of a page for each training view, without refinement
 
@@ -110,12 +111,19 @@ def find_poses(source: Path, folder: Path, say: Callable[[str], None], progress:
     """Return the capture: the source if it is one, or that of an earlier call, or a new one."""
     if source.is_dir() and is_capture(source):
         return source
-    place = folder / CAPTURE
+    place, note, here = folder / CAPTURE, folder / SOURCE, str(source.resolve())
     if is_capture(place):
-        say(f"poses: those in {place}")
+        made_of = read_json(note, "note of a scene") if note.is_file() else None
+        if made_of != {"source": here}:
+            raise InputError(
+                f"expected the scene of {here} in {folder}, found one of other photographs or of an unknown source; choose another --out"
+            )
+        say(f"poses: those in {place}; after a change of the photographs, remove that folder and {folder / RUN}")
         return place
-    note = reconstruct(source, place, SfmOptions(), say=say, progress=progress)
-    say(f"poses: {note['with_pose']} of {note['photographs']} photographs, {note['points']:,} points")
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(note, {"source": here})
+    found = reconstruct(source, place, SfmOptions(), say=say, progress=progress)
+    say(f"poses: {found['with_pose']} of {found['photographs']} photographs, {found['points']:,} points")
     return place
 
 

@@ -1,5 +1,5 @@
-"""Which photographs are matched with each other. Matching takes half a second of a core a pair, so
-all pairs of 128 photographs take more than an hour."""
+"""Which photographs are matched with each other. A pair takes half a second of a core, and all
+pairs of 128 photographs more than an hour."""
 
 from __future__ import annotations
 

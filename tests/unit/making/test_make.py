@@ -116,6 +116,9 @@ def test_photographs_get_poses_first(tmp_path, capture, trained, monkeypatch):
     for _ in range(2):
         made = make(tmp_path / "photos", tmp_path / "out", say=lambda _: None)
     assert asked == [tmp_path / "out" / "capture"] and made.capture == asked[0]
+    (tmp_path / "others").mkdir()
+    with pytest.raises(InputError, match=naming(tmp_path / "others")):
+        make(tmp_path / "others", tmp_path / "out", say=lambda _: None)
 
 
 def test_no_time_is_no_budget(tmp_path):
