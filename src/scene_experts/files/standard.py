@@ -72,18 +72,17 @@ class Made:
     whole: Splats  # before Gaussians were left out
     about: dict[str, Any]  # how they were baked and selected
     before: dict[str, tuple[Scene, int]]  # scenes to measure too
-    seconds: float  # of the bake
+    seconds: float  # of the bake; 0 for one that the run had kept
     lines: tuple[str, ...]  # what was left out
 
 
-def _make_gaussians(work: ExportTask, world: World, capture: Capture | None) -> Made:
+def _make_gaussians(work: ExportTask, world: World, capture: Capture | None, level: int | None) -> Made:
     """Bake the run's scene where that is needed, and leave out what the options say."""
     options, gaussians = work.options, family_named(GAUSSIANS)
     assert gaussians is not None
-    began = time.perf_counter()
-    made, about, before = (work.run, {}, {}) if work.is_direct else _bake(work, capture)
+    made, about, before, seconds = (work.run, {}, {}, 0.0) if work.is_direct else _bake(work, capture, whole=level is None)
     whole = contents = gaussians.contents(made, world, {})
-    seconds, lines = time.perf_counter() - began, []
+    lines = []
     whole.expect_finite("the scene")
     if options.floaters == "remove":
         from scene_experts.files.select import find_floaters
@@ -116,7 +115,7 @@ def export_gaussians(
     with nullcontext() if level is None else run.scene.at_level(level):
         fresh = key not in made
         if fresh:
-            made[key] = _make_gaussians(work, world, capture)
+            made[key] = _make_gaussians(work, world, capture, level)
         one = made[key]
         contents, bake = one.contents.up_to_degree(format.sh_degree), not work.is_direct
         about = _describe(work, contents, level) | one.about | origin_note(origin)
@@ -132,7 +131,7 @@ def export_gaussians(
         frame = f"{whose} own frame" if options.frame == "capture" else "the trained world"
         frame += f", {tell_origin(origin)}" if any(origin) else ""
         said = f"{len(contents):,} Gaussians, {facts['bytes'] / 1e6:.2f} MB, harmonics of degree {contents.degree}, in {frame}"
-        how = f"; baked in {format_duration(one.seconds)}" if fresh else "; of the same bake"
+        how = "; of the same bake" if not fresh else f"; baked in {format_duration(one.seconds)}" if one.seconds else "; of the run's bake"
         how += " from cameras around the scene" if around else ""
         lines = (f"wrote {path}", said + (how if bake else ""), *one.lines, *([str(told)] if told is not None else []))
         written = Written(path, facts["bytes"], len(contents), lines)
@@ -148,17 +147,30 @@ def export_gaussians(
     return written
 
 
-def _bake(work: ExportTask, capture: Capture | None) -> tuple[OpenRun, dict[str, Any], dict[str, tuple[Scene, int]]]:
-    """The run with baked Gaussians, the entries of its description about the bake, and the scene
-    before its refinement to measure too."""
+def _bake(
+    work: ExportTask, capture: Capture | None, *, whole: bool
+) -> tuple[OpenRun, dict[str, Any], dict[str, tuple[Scene, int]], float]:
+    """The run with baked Gaussians, the entries of its description about the bake, the scene before
+    its refinement to measure too, and the seconds it took.
+
+    whole: All levels of detail; the run keeps that bake.
+    """
+    from scene_experts.files.bake import kept
     from scene_experts.files.bake.bake import DRAWN_AT, Bake, Refine, bake
 
     assert capture is not None
-    options = work.options
+    options, began = work.options, time.perf_counter()
     how = Bake(options.sh_degree, options.max_gaussians, options.prune, Refine(options.refine))
-    baked = bake(work.run, capture, how, work.rasterize, work.tell)
-    before: dict[str, tuple[Scene, int]] = {"closed_form": (baked.closed_form, DRAWN_AT)} if options.refine else {}
-    return replace(work.run, scene=baked.scene), baked.about, before
+    baked = kept.load(work.run, capture, how) if whole else None
+    seconds = 0.0
+    if baked is None:
+        baked = bake(work.run, capture, how, work.rasterize, work.tell)
+        seconds = time.perf_counter() - began
+        if whole:
+            kept.keep(work.run, capture, how, baked)
+    refined = options.refine and baked.closed_form is not None
+    before: dict[str, tuple[Scene, int]] = {"closed_form": (baked.closed_form, DRAWN_AT)} if refined else {}  # type: ignore[dict-item]
+    return replace(work.run, scene=baked.scene), baked.about, before, seconds
 
 
 def _describe(work: ExportTask, contents: Any, level: int | None) -> dict[str, Any]:

@@ -60,8 +60,8 @@ class Baked:
     """A baked scene in the trained world."""
 
     scene: GaussianScene
-    closed_form: GaussianScene
-    """The same before its refinement."""
+    closed_form: GaussianScene | None
+    """The same before its refinement; None for one that a run has kept."""
     about: dict[str, Any]
     """How it was baked, as JSON values: all settings, and how many Gaussians contributed to any
     view."""
