@@ -26,7 +26,7 @@ class SfmOptions:
     matching: Matching = "auto"
     """Which photographs are matched. exhaustive: all pairs. sequential: neighbours in the order of
     their names, as for a walk. auto: all pairs of up to 30 photographs; of more, each with those
-    that look like it and with its neighbours."""
+    that look like it, with its neighbours and, by GPS, with those taken near it."""
     camera_model: CameraModel = "OPENCV"
     """COLMAP's lens model. Photographs of the same size, camera and focal length share one lens."""
     mapper: Mapper = "auto"

@@ -7,12 +7,14 @@ from itertools import combinations
 from pathlib import Path
 
 from scene_experts.sfm.options import Matching
+from scene_experts.sfm.positions import find_near, read_positions
 from scene_experts.sfm.retrieval import describe_photos, rank_alike
 
 MOST_EXHAUSTIVE = 30  # photographs that are all matched with each other
 NEIGHBOURS = 10  # following photographs that each photograph is matched with where the order alone decides
 ALIKE = 10  # photographs that each is matched with because they look alike: with 8, all 128 of South Building get poses
 FOLLOWING = 3  # and those that follow it in the order of the names
+NEAR = 8  # and those that were taken nearest to it, where GPS says so
 SPARE = 20  # more that look alike, for photographs that fit too few others
 
 
@@ -41,11 +43,12 @@ def find_alike(database: Path, names: list[str]) -> tuple[list[tuple[int, int]],
     """Return the pairs of photographs that are matched, and more pairs for those that fit too few
     others.
 
-    Each photograph is matched with the ALIKE that look most like it and with the FOLLOWING next
-    ones.
+    Each photograph is matched with the ALIKE that look most like it, with the FOLLOWING next ones
+    and with the NEAR that were taken nearest to it, where their cameras noted the places.
     """
     ranks = rank_alike(describe_photos(database, names), ALIKE + SPARE)
     ordered = lambda i, j: (min(i, j), max(i, j))  # noqa: E731
-    near = {ordered(i, int(j)) for i, row in enumerate(ranks) for j in row[:ALIKE]} | set(follow(len(names), [*range(1, FOLLOWING + 1)]))
+    near = {ordered(i, int(j)) for i, row in enumerate(ranks) for j in row[:ALIKE]}
+    near |= {*follow(len(names), [*range(1, FOLLOWING + 1)]), *find_near(read_positions(database, names), NEAR)}
     more = {ordered(i, int(j)) for i, row in enumerate(ranks) for j in row[ALIKE:]}
     return sorted(near), sorted(more - near)

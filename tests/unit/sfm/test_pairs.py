@@ -23,7 +23,9 @@ def test_photographs_are_matched_with_those_like_them_and_with_the_next_ones(mon
     ranks = [[(i + step) % 50 for step in (25, 24, *range(1, 24), *range(26, 31))] for i in range(50)]
     monkeypatch.setattr(pairs, "describe_photos", lambda database, names: names)
     monkeypatch.setattr(pairs, "rank_alike", lambda vectors, count: ranks)
+    monkeypatch.setattr(pairs, "read_positions", lambda database, names: None)
+    monkeypatch.setattr(pairs, "find_near", lambda positions, count: [(3, 44)])
     near, spare = pairs.find_alike(None, ["photo"] * 50)
-    assert {(0, 25), (0, 24), (0, 1), (0, 2), (0, 3), (48, 49)} <= set(near) and (0, 12) in spare
+    assert {(0, 25), (0, 24), (0, 1), (0, 2), (0, 3), (3, 44), (48, 49)} <= set(near) and (0, 12) in spare
     assert near == sorted(set(near)) and not set(near) & set(spare) and all(i < j for i, j in [*near, *spare])
-    assert len(near) <= 50 * (pairs.ALIKE + pairs.FOLLOWING)
+    assert len(near) <= 50 * (pairs.ALIKE + pairs.FOLLOWING) + 1
