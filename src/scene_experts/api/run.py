@@ -265,7 +265,7 @@ class Run:
         sh_degree: int = 3,
         max_gaussians: int = 0,
         prune: float = 0.0,
-        refine: int = 1000,
+        refine: int | None = None,
         frame: Literal["capture", "trained"] = "capture",
         crop: str | None = None,
         floaters: Literal["keep", "remove"] = "keep",
@@ -289,7 +289,7 @@ class Run:
             prune: Standard files: leave out the Gaussians that contribute least, up to this share
                 (0 to 1) of all contributions.
             refine: Standard files: iterations that fit the baked Gaussians to pictures of the run;
-                0 for none.
+                0 for none. Default: 200 to 1000, by how far they are from them.
             frame: Standard files: the frame of the capture, or the trained world.
             crop: Standard files: keep what is inside "sphere:RADIUS" (around the point that the
                 cameras look at; "1.2x" counts in their distance from it), "sphere:X,Y,Z,RADIUS" or

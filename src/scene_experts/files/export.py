@@ -162,7 +162,7 @@ def _expect_for_file(run: OpenRun, formats: Sequence[str], out: Path | None, opt
 def _check(options: Options) -> None:
     """Raises InputError, naming the flag, for values out of range."""
     for name in ("sh_degree", "max_gaussians", "refine"):
-        if getattr(options, name) < 0:
+        if (getattr(options, name) or 0) < 0:
             raise InputError(f"expected {_flag(name)} of at least 0, found {getattr(options, name)}; give a larger number")
     if options.sh_degree > MAX_DEGREE:
         raise InputError(f"expected --sh-degree of at most {MAX_DEGREE}, found {options.sh_degree}; give a lower degree")

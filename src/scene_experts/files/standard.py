@@ -147,9 +147,7 @@ def export_gaussians(
     return written
 
 
-def _bake(
-    work: ExportTask, capture: Capture | None, *, whole: bool
-) -> tuple[OpenRun, dict[str, Any], dict[str, tuple[Scene, int]], float]:
+def _bake(work: ExportTask, capture: Capture | None, *, whole: bool) -> tuple[OpenRun, dict[str, Any], dict[str, tuple[Scene, int]], float]:
     """The run with baked Gaussians, the entries of its description about the bake, the scene before
     its refinement to measure too, and the seconds it took.
 
@@ -168,7 +166,7 @@ def _bake(
         seconds = time.perf_counter() - began
         if whole:
             kept.keep(work.run, capture, how, baked)
-    refined = options.refine and baked.closed_form is not None
+    refined = options.refine != 0 and baked.closed_form is not None
     before: dict[str, tuple[Scene, int]] = {"closed_form": (baked.closed_form, DRAWN_AT)} if refined else {}  # type: ignore[dict-item]
     return replace(work.run, scene=baked.scene), baked.about, before, seconds
 

@@ -20,7 +20,7 @@ LOOK = 0.1  # share of the iterations after which the speed is known
 CLOSE = (0.8, 1.3)  # a training whose time will be this share of what it has is not begun anew
 LEAST, MOST, MOST_OF_FEW = 300, 30_000, 7_000  # iterations; the last with few photographs (`bench.advice.FEW`)
 PAGE_GUESS = 60.0  # seconds, before anything is known
-LEAST_REFINE, MOST_REFINE = 0, 1000  # iterations that fit the page's Gaussians
+MOST_REFINE = 1000  # iterations that fit the page's Gaussians; with time for them, the bake decides
 
 
 @dataclass(frozen=True)
@@ -94,12 +94,14 @@ def find_slowness(iterations: int, step: int, seconds: float, minutes: float | N
     return expected / 60 / minutes if minutes else expected / max(have, 1e-9)
 
 
-def choose_refinement(left: float | None, iteration: float, base: float) -> int:
-    """Return the iterations that fit a page's Gaussians to the scene, for the seconds that are left.
+def choose_refinement(left: float | None, iteration: float, base: float) -> int | None:
+    """Return the iterations that fit a page's Gaussians to the scene, for the seconds that are left;
+    None where the bake may choose.
 
     iteration: Seconds of one iteration of the training at its end. base: Seconds of the page without
     any.
     """
     if left is None:
-        return MOST_REFINE
-    return min(max(int((left - base) / max(iteration, 1e-9)), LEAST_REFINE), MOST_REFINE)
+        return None
+    fits = max(int((left - base) / max(iteration, 1e-9)), 0)
+    return fits if fits < MOST_REFINE else None

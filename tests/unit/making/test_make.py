@@ -69,7 +69,7 @@ def test_all_photographs_are_trained_on_and_a_page_is_written(capture, tmp_path,
     made = make(capture, tmp_path / "out", say=said.append)
     (one,) = trained.made
     assert len(one.capture.train_cameras) == 9 and one.recipe.recipe == "scaffold-gs" and one.recipe.iterations == 1000
-    assert made.page == tmp_path / "out" / "scene.html" and json.loads(made.page.read_text()) == {"refine": 1000, "title": "box"}
+    assert made.page == tmp_path / "out" / "scene.html" and json.loads(made.page.read_text()) == {"refine": None, "title": "box"}
     assert (
         made.report is None
         and made.psnr == 25.0

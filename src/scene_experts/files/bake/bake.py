@@ -99,10 +99,10 @@ def bake(run: OpenRun, capture: Capture, how: Bake, rasterize: Rasterizer | None
     columns |= {"sh_dc": sh[:, 0].contiguous(), "sh_rest": sh[:, 1:].contiguous()}
     del sums, sh
     first = scene_of(columns, scene.extent)
-    if not how.refine.iterations:
+    if how.refine.iterations == 0:
         return Baked(first, first, about)
     second = scene_of({name: value.clone() for name, value in columns.items()}, scene.extent)
-    refine(second, painter, views, torch.tensor(capture.background), how.refine, how.seed, tell)
+    about["refined"] = refine(second, painter, views, torch.tensor(capture.background), how.refine, how.seed, tell)
     return Baked(without_faint(second), first, about)
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 
 from scene_experts.core.types import Mode
-from scene_experts.files.bake.refine import Refine, refine
+from scene_experts.files.bake.refine import CLOSE, FAR, LEAST, MOST, Refine, compare, iterations_for, refine
 from scene_experts.files.bake.views import Views
 from scene_experts.files.gaussians.read import DRAWN_AT, scene_of
 from scene_experts.files.measure import Painter
@@ -37,8 +37,15 @@ def test_disturbed_gaussians_draw_the_same_picture_again(tmp_path):
     for _ in range(2):
         scene, said = scene_of({name: value.clone() for name, value in moved.items()}, capture.extent), []
         before = error(scene)
-        refine(scene, Painter.of(true, DRAWN_AT, draw), views, background, Refine(60), 3, lambda *what, said=said: said.append(what))
+        painter = Painter.of(true, DRAWN_AT, draw)
+        assert compare(true, painter, views, background) > 90 > 60 > compare(scene, painter, views, background)
+        assert refine(scene, painter, views, background, Refine(60), 3, lambda *what, said=said: said.append(what)) == 60
         assert said[-1] == ("refining", 60, 60) and error(scene) < 0.5 * before
         found.append(scene.table.params["sh_rest"].detach())
     assert torch.equal(*found)
     capture.images.close()
+
+
+def test_the_iterations_follow_from_how_far_the_scene_is():
+    assert [iterations_for(psnr) for psnr in (60.0, CLOSE, FAR, 10.0)] == [LEAST, LEAST, MOST, MOST]
+    assert iterations_for((CLOSE + FAR) / 2) == (LEAST + MOST) // 2
