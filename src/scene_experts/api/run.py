@@ -270,6 +270,7 @@ class Run:
         crop: str | None = None,
         floaters: Literal["keep", "remove"] = "keep",
         title: str | None = None,
+        cells: int = 256,
     ) -> Path:
         """Write the scene to a file that other tools or later runs read.
 
@@ -277,7 +278,7 @@ class Run:
             format: "compact" is one small file of this package. "anchors" is the Scaffold-GS folder
                 layout. "ply", "compressed-ply", "splat", "spz", "sog", "glb", "usd" and "html" (a
                 page with a viewer) are standard files of Gaussians; scenes of anchors are baked for
-                them, which takes minutes.
+                them, which takes minutes. "mesh" is a PLY or GLB file of coloured triangles.
             out: File or folder; a name without a suffix is a folder. Default: inside the run
                 folder.
             quality: compact: dB of PSNR that the training views may lose.
@@ -297,6 +298,7 @@ class Run:
             floaters: Standard files: "remove" leaves out Gaussians that no training photograph
                 supports.
             title: html: title of the page. Default: the name of the capture.
+            cells: mesh: voxels along its longest side, 8 to 2048.
 
         Returns:
             The path of the file or folder.
@@ -306,7 +308,7 @@ class Run:
                 unknown or out of range.
             RunError: The disk is full.
         """
-        options = Options(False, quality, target_mb, sh_degree, max_gaussians, prune, refine, frame, crop, floaters, title)
+        options = Options(False, quality, target_mb, sh_degree, max_gaussians, prune, refine, frame, crop, floaters, title, cells)
         expect_words(options)
         folder, opened = self._in_folder("export"), self._opened
         if self._device != "cpu":

@@ -8,17 +8,18 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 from scene_experts.core.errors import InputError
-from scene_experts.core.io import check_writable, write_bytes
+from scene_experts.core.io import check_writable, write_bytes, write_json
 from scene_experts.data.views import World
 from scene_experts.files.measure import Tell, capture_if_there, cost
 from scene_experts.files.options import DEFAULT, MAX_DEGREE, Options
 from scene_experts.files.placed import AROUND
 from scene_experts.files.registry import GAUSSIANS, Family, Format, family_named, format_named, format_names, formats_of
 from scene_experts.files.scene_folder import origin_note, origin_of, tell_origin, trained_in, width_in, world_of, write_scene_folder
-from scene_experts.files.standard import ExportTask, Made, Written, export_gaussians
+from scene_experts.files.standard import NOTE_FORMAT, ExportTask, Made, Written, export_gaussians
 from scene_experts.render import Rasterizer
 from scene_experts.training.run_folder import OpenRun
 
+DRAWN_OPTIONS = ("measure", "crop", "cells")  # of formats that hold what pictures show
 FITTED = ("quality", "target_mb")  # options of formats that choose a precision
 NAME = "scene"  # of files whose name the caller does not choose
 
@@ -96,7 +97,9 @@ def export_several(
                 work.format.needs()
     # the other options are those of the standard files then
     own = Options(measure=options.measure, quality=options.quality, target_mb=options.target_mb) if standard else options
-    written = [_export_scene(replace(work, options=own), out) for work in works if work.format.family != GAUSSIANS]
+    written = [_export_drawn(work, out) for work in works if work.format.draw is not None]
+    rest = [work for work in works if work.format.draw is None and work.format.family != GAUSSIANS]
+    written += [_export_scene(replace(work, options=own), out) for work in rest]
     if standard:
         made: dict[tuple[int | None, int], Made] = {}
         selects = bool(options.crop) or options.floaters == "remove"
@@ -227,6 +230,25 @@ def _export_scene(work: ExportTask, out: Path | None) -> Written:
     with capture_if_there(run, needed=False) as capture:
         found = cost(run, lambda: {"file": family.scene(run, format.read(path), world)}, capture, work.rasterize, work.tell)  # type: ignore[misc]
     return replace(written, lines=(*written.lines, *found.lines), psnr=found.psnr)
+
+
+def _export_drawn(work: ExportTask, out: Path | None) -> Written:
+    """Write what the pictures of a run show."""
+    run, format = work.run, work.format
+    assert format.draw is not None and format.write is not None
+    for f in fields(work.options):
+        if f.name not in DRAWN_OPTIONS and getattr(work.options, f.name) != f.default:
+            raise InputError(f"expected {_flag(f.name)} with another format, found --format {work.name}; leave it out")
+    path = place_of(run, work.name, format, out)
+    check_writable(path)
+    if format.needs is not None:
+        format.needs()
+    with capture_if_there(run, needed=True) as capture:
+        contents, note = format.draw(run, capture, work.options, work.rasterize, work.tell)
+    format.write(path, contents, note)
+    size, said = path.stat().st_size, str(contents)
+    write_json(path.with_name(path.name + ".json"), {"format": NOTE_FORMAT, "recipe": run.config.train.recipe, "step": run.step, **note})
+    return Written(path, size, len(contents), (f"wrote {path}", f"{said}, {size / 1e6:.2f} MB, in the capture's own frame"))
 
 
 def _export_folder(work: ExportTask, family: Family, world: World, out: Path) -> Written:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from scene_experts.arguments.option import Option
+from scene_experts.core.fields import Range
 
 MAX_DEGREE = 3  # of spherical harmonics in any format
 
@@ -47,6 +48,8 @@ class Options:
     than 0.3 pixels of each, and large, faint ones that fewer than 4 show."""
     title: str | None = None
     """html: title of the page; by default it names the capture."""
+    cells: Annotated[int, Range(8, 2048)] = 256
+    """mesh: voxels along its longest side."""
     levels: bool = False
     """Standard files: one file per level of detail, each without the finer levels."""
 

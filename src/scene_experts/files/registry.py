@@ -44,6 +44,7 @@ FORMATS = {
     "sog": "scene_experts.files.formats.sog",
     "glb": "scene_experts.files.formats.glb",
     "usd": "scene_experts.files.formats.usd",
+    "mesh": "scene_experts.files.mesh",
     "html": "scene_experts.files.formats.html",
 }
 """Name on the command line -> module that states the format as `FORMAT`."""
@@ -62,6 +63,7 @@ FAMILIES = {
 """Family of a scene (`Traits.family`) -> module that states the family's files as `FAMILY`."""
 
 GAUSSIANS = "gaussians"  # the family whose files hold standard Gaussians; other scenes are baked for them
+DRAWN = "drawn"  # of formats that hold what a scene's pictures show, whatever it is made of
 ENTRY_POINTS = "scene_experts.formats"
 HEAD = 4096  # bytes that formats are recognised by
 _OWN_NAME = re.compile(r"scene(_level\d+)?(\.[^.]+)+")
@@ -78,7 +80,7 @@ class Format:
     """How file names end, with the dot; empty for the result folder of a family."""
     family: str = GAUSSIANS
     """The scenes that it holds as they are. A format of "gaussians" holds every other scene too,
-    baked to standard Gaussians."""
+    baked to standard Gaussians; one of "drawn" what their pictures show."""
     write: Callable[[Path, Any, Note], object] | None = None
     """write(path, contents, note): writes one file atomically. contents: what `Family.contents`
     returns, for "gaussians" a `Splats`. note: how the file was made, as JSON values, for formats
@@ -114,6 +116,10 @@ class Format:
     options ask for (`quality`, `target_mb`), and sentences about that for the terminal. world: of
     the run, in the frame of its capture. capture: None where it is gone. None: contents are written
     as they are, and those options are refused."""
+
+    draw: Callable[..., tuple[Any, Note]] | None = None
+    """draw(run, capture, options, rasterize, tell): the contents of a file of "drawn", in the
+    capture's own frame, and how they were made."""
 
     @property
     def is_folder(self) -> bool:
