@@ -100,9 +100,11 @@ def fuse(
     total = np.zeros((len(blocks), SIDE**3), np.float32)
     weight = np.zeros_like(total)
     for first in range(0, len(blocks), _MANY):
-        part = slice(first, first + _MANY)
-        places = (origin + voxel * (SIDE * blocks[part][:, None] + inside)).reshape(-1, 3)
+        corner = origin + voxel * SIDE * blocks[first : first + _MANY]
         for view in views:
+            chosen = _may_see(view.camera, corner + voxel * SIDE / 2, voxel * SIDE)
+            part = first + chosen
+            places = (corner[chosen][:, None] + voxel * inside).reshape(-1, 3)
             at, seen = sample(view, places)
             away = (at - _z(view.camera, places)) / (TRUNCATION * voxel)
             counts = (seen & (away >= -1)).reshape(-1, SIDE**3)
@@ -111,6 +113,18 @@ def fuse(
         tell(min(first + _MANY, len(blocks)), len(blocks))
     shape = (-1, SIDE, SIDE, SIDE)
     return Volume(origin, voxel, blocks, (total / np.maximum(weight, 1)).reshape(shape), weight.reshape(shape))
+
+
+def _may_see(camera: Camera, centres: Points, radius: float) -> NDArray[np.int64]:
+    """Return which spheres [n] a camera may see."""
+    pose, K = camera.world_to_cam.double().numpy(), camera.K.double().numpy()
+    x, y, z = (centres @ pose[:3, :3].T + pose[:3, 3]).T
+    z = np.maximum(z, 0)  # one beside the camera may reach into the picture
+    left, right = -K[0, 2] / K[0, 0], (camera.width - K[0, 2]) / K[0, 0]
+    top, bottom = -K[1, 2] / K[1, 1], (camera.height - K[1, 2]) / K[1, 1]
+    reach = radius * (1 + max(abs(left), abs(right), abs(top), abs(bottom)))
+    inside = (x > left * z - reach) & (x < right * z + reach) & (y > top * z - reach) & (y < bottom * z + reach)
+    return np.flatnonzero(inside & (centres @ pose[2, :3] + pose[2, 3] > -radius))
 
 
 def _z(camera: Camera, places: Points) -> Points:
