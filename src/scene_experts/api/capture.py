@@ -217,7 +217,7 @@ def load_capture(
     leave_out: Sequence[str] = (),
     missing: Literal["error", "drop"] = "error",
     normalise: Literal["extent", "none"] | None = None,
-    init: Literal["points", "dense", "random"] = "points",
+    init: Literal["auto", "points", "dense", "random"] = "auto",
     points: str | Path | None = None,
     model: str | None = None,
     max_views: int | None = None,
@@ -245,7 +245,8 @@ def load_capture(
             capture's own unit. Default: "none" for a scene of the catalog, else "extent".
             Everything that the API returns is in the capture's own unit either way.
         init: Start from the capture's 3D "points", from "dense" ones that a training computes from
-            its photographs, or from "random" ones.
+            its photographs, or from "random" ones. "auto": "dense" where the recipe asks for it
+            (`dense_views`), else "points".
         points: File of points to start from instead: PLY, or COLMAP's points3D.bin or points3D.txt,
             in the frame of the capture's poses.
         model: Which reconstruction of the capture is read if it has several: a folder ("sparse/1")

@@ -27,6 +27,7 @@ EXTRAS = {
     "video": ("imageio_ffmpeg", "videos (render --out FILE.mp4, capture VIDEO)"),
     "spz4": ("zstandard", "SPZ files of version 4 (import)"),
     "usd": ("pxr", "OpenUSD files (export --format usd, import)"),
+    "mesh": ("skimage", "meshes (export --format mesh)"),
     "plots": ("matplotlib", "figures (reproduce)"),
     "tensorboard": ("tensorboard", "TensorBoard (train --tensorboard)"),
     "cluster": ("distributed", "runs on several machines (reproduce --cluster)"),

@@ -28,6 +28,7 @@ from scene_experts.data.fetch.catalog import defaults_in
 from scene_experts.data.settings import Data
 from scene_experts.render import Rasterizer
 from scene_experts.training import run_folder
+from scene_experts.training.background import with_background
 from scene_experts.training.batch import check_batch
 from scene_experts.training.config import RunConfig, Train, with_numbers
 from scene_experts.training.events import Exported, Stopped
@@ -110,6 +111,9 @@ def train(args: list[str]) -> int:
     what = f"{command.cfg.recipe} on {capture.name} ({len(capture.train)} training views, {len(capture.test)} held out)"
     together = f", {group.size} processes" if group.size > 1 else ""
     console.print(f"{what}, {run.device}, rasteriser {rasterize.name}{together}", soft_wrap=True)
+    if run.config.data.background != command.data.background:
+        colour = " ".join(f"{value:g}" for value in capture.background)
+        console.print(f"background: the photographs' mean colour, {colour} (choose another with --background)", soft_wrap=True)
     code = follow(command, run, capture, rasterize, console)
     group.leave()
     return code
@@ -139,7 +143,9 @@ def prepare(command: TrainCommand, line: str, group: Alone) -> tuple[TrainComman
         lambda: backend(options.device, options.rasterizer, command.cfg.antialias, options.deterministic),
     )
     run_folder.check(command.out, run.config, options.resume, options.overwrite)
-    return command, replace(run, device=device), captures.load(command.data, command.cfg.seed), rasterize
+    begun = run_folder.as_begun(command.out, run.config) if options.resume else run.config
+    config, capture = with_background(begun, captures.load(begun.data, command.cfg.seed))
+    return command, replace(run, config=config, device=device), capture, rasterize
 
 
 def run_of(command: TrainCommand, line: str) -> Job:

@@ -69,7 +69,7 @@ def load(data: Data, seed: int = 0, *, allow_no_points: bool = False, cache_byte
         else:
             capture = prepare.measure_extent(capture)
         capture = prepare.drop_outliers(capture)
-        replaceable = data.init == "points" and (capture.bounds is not None or raw.random_points)
+        replaceable = data.init in ("auto", "points") and (capture.bounds is not None or raw.random_points)
         if data.init == "random" or (capture.points is None and replaceable):
             capture = _add_random_points(capture, seed, warn=data.init != "random")
         elif capture.points is None:
@@ -210,7 +210,7 @@ def _add_random_points(capture: Capture, seed: int, warn: bool) -> Capture:
     if warn:
         note = f"no 3D points: training starts from {prepare.RANDOM_POINTS:,} random points"
         capture = replace(capture, warnings=(*capture.warnings, note))
-    return prepare.add_random_points(capture, seed=seed)
+    return replace(prepare.add_random_points(capture, seed=seed), random_points=True)
 
 
 def _check_no_points(capture: Capture, source: str, allow: bool) -> Capture:

@@ -38,9 +38,10 @@ class Data:
     normalise: Literal["extent", "none"] = "extent"
     """extent: scale the world to a camera extent of 5 for the training; every exported file is
     scaled back. none: train in the capture's own units."""
-    init: Literal["points", "dense", "random"] = "points"
+    init: Literal["auto", "points", "dense", "random"] = "auto"
     """Start from the capture's 3D points, from denser ones that are computed from the training
-    photographs (dense), or from random points."""
+    photographs (dense), or from random points. auto: dense where the recipe asks for it
+    (--dense-views), else points."""
     points: Annotated[Path | None, Option(value="FILE")] = None
     """Start from the points of this file instead: a PLY file, or points3D.bin or points3D.txt of
     COLMAP, in the frame of the capture's poses."""

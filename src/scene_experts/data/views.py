@@ -132,6 +132,7 @@ class Capture:
     bounds: tuple[Vector, Vector] | None = None  # lower and upper corner of the scene in the capture's own frame; None: unknown
 
     applied: object = None  # rows of the 3x4 matrix that turned a reconstruction into the capture's own frame, unchecked
+    random_points: bool = False  # its points are random
     omitted: tuple[str, ...] = ()  # names of the photographs that --leave-out leaves out; they have no views
     left_out: tuple[int, ...] = ()  # indices of training views that --views leaves out; they still identify the capture
 

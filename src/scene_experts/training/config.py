@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from scene_experts.arguments.option import Option
 from scene_experts.core.errors import InputError
-from scene_experts.core.fields import Count, CountOrNone, Range, Share, changed_without, check_fields, flag_of, scale
+from scene_experts.core.fields import SCALES, Count, CountOrNone, Range, Share, changed_without, check_fields, flag_of, scale
 from scene_experts.core.parts import Part, find
 from scene_experts.data.settings import Data
 from scene_experts.scene import EXPLICIT, LearningRates, SceneConfig
@@ -60,7 +60,17 @@ class Train:
     antialias: bool = False
     """Compensate the opacity for the 0.3 px blur (2D filter of Mip-Splatting)."""
     random_background: bool = False
-    """Use a random background colour in each iteration."""
+    """Train over a random background colour in each iteration, so that everything the photographs
+    show becomes opaque. Transparent photographs keep the colour that they are composited over."""
+    random_background_from: Annotated[int, Range(0), SCALES] = 0
+    """Iteration after which the background is random; until then it is that of the capture.
+    --iterations rescales it."""
+    dense_views: CountOrNone = 0
+    """With at most this many training views, start from points that a plane sweep finds in them,
+    unless --init or --points says where to start."""
+    mean_background: bool = False
+    """Put the mean colour of the training photographs behind what none of them shows, unless
+    --background names a colour or the photographs are transparent or masked."""
     max_anchors: CountOrNone = 0
     """Stop densification at this number of anchors; 0 leaves that of the growth rule (a million for
     3dgs-mcmc, otherwise none)."""

@@ -18,7 +18,7 @@ from scene_experts.core.group import Alone
 from scene_experts.core.schedule import passes
 from scene_experts.core.types import Decoded, Mode, Render, Routing
 from scene_experts.data.capture import Capture
-from scene_experts.data.dense import start_densely
+from scene_experts.data.dense import NoDenseStartError, start_densely
 from scene_experts.render import Rasterizer, for_training
 from scene_experts.scene import Scene
 from scene_experts.strategy import Edit
@@ -183,13 +183,23 @@ def begin(cfg: Train, run: Job, capture: Capture, folder: Path | None, rasterize
 
 
 def start(cfg: Train, run: Job, capture: Capture) -> Training:
-    """Start a training from the capture's points, or with --init dense from those of
-    `data.dense`. `cfg` must be scaled. Raises InputError as `train`."""
-    if run.config.data.init != "dense":
+    """Start a training from the capture's points, or with --init dense, and with few views where the
+    recipe asks for it, from those of `data.dense`. `cfg` must be scaled. Raises InputError as
+    `train`."""
+    data = run.config.data
+    by_recipe = data.init == "auto" and data.points is None and not capture.random_points and len(capture.train) <= cfg.dense_views
+    if data.init != "dense" and not by_recipe:
         return Training.start(cfg, capture, run.device, run.dtype)
-    found = start_densely(capture, cfg.growth.max_anchors)
+    try:
+        found = start_densely(capture, cfg.growth.max_anchors)
+    except NoDenseStartError as error:
+        if not by_recipe:
+            raise
+        training = Training.start(cfg, capture, run.device, run.dtype)
+        training.computed = f"the capture's points; a plane sweep finds no denser ones: it needs {error.expected} and found {error.why}"
+        return training
     training = Training.start(cfg, replace(capture, points=found.points), run.device, run.dtype)
-    training.computed = found.describe()
+    training.computed = found.describe() + ("; --init points starts from the capture's own" if by_recipe else "")
     return training
 
 

@@ -48,8 +48,9 @@ class Resident:
         return rgb.to(self.dtype).div_(255.0), mask
 
     def background(self, color: Tensor | None) -> Tensor:
-        """Return a background [3] on the device; None is that of the capture."""
-        if color is not None:
+        """Return a background [3] on the device. None is that of the capture, and so is every
+        colour where transparent photographs were composited over it."""
+        if color is not None and self.capture.alpha_over is None:
             return upload(color, self.device, self.dtype)
         found = self.backgrounds.get(self.capture.background)
         if found is None:

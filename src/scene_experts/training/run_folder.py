@@ -104,7 +104,7 @@ def check(out: Path, config: RunConfig, resume: bool, overwrite: bool = False) -
     if resume and not (out / "config.json").is_file():
         raise InputError(f"expected an earlier run to resume in {out}, found none; begin one without --resume, or correct --out")
     if resume:
-        _check_same(out, read_config(out), config)
+        _check_same(out, read_config(out), as_begun(out, config))
     elif not overwrite and any((out / "checkpoints").glob("ckpt_*.safetensors")):
         imported = config.command.startswith(("import ", "merged "))
         go_on = "" if imported else "continue it with --resume, replace it with --overwrite (in Python: resume=True, overwrite=True), or "
@@ -195,11 +195,15 @@ def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False,
 
 
 def as_begun(out: Path, config: RunConfig) -> RunConfig:
-    """Return the configuration with the `init_from` of the run in `out`, unless it has one or there
-    is no run. For a run to resume."""
-    if config.init_from is not None or not (out / "config.json").is_file():
+    """Return the configuration with what the run in `out` decided where it decides nothing itself:
+    `init_from`, and the background of `train.mean_background`. Unchanged if there is no run. For a
+    run to resume."""
+    if not (out / "config.json").is_file():
         return config
-    return replace(config, init_from=read_config(out).init_from)
+    begun = read_config(out)
+    if config.train.mean_background and config.data.background is None:
+        config = replace(config, data=replace(config.data, background=begun.data.background))
+    return config if config.init_from is not None else replace(config, init_from=begun.init_from)
 
 
 def as_trained(out: Path, config: RunConfig) -> RunConfig:

@@ -143,11 +143,12 @@ class Training:
 
     def next_batch(self, train: tuple[int, ...]) -> list[tuple[int, Tensor | None]]:
         """Return the next `cfg.batch` training views, each with its random background [3], or None
-        without random backgrounds."""
+        while backgrounds are not random."""
+        at_random = self.cfg.random_background and self.step > self.cfg.random_background_from
         batch: list[tuple[int, Tensor | None]] = []
         for _ in range(self.cfg.batch):
             index, _ = self.next_view(train)
-            batch.append((index, torch.rand(3, generator=self.views_rng) if self.cfg.random_background else None))
+            batch.append((index, torch.rand(3, generator=self.views_rng) if at_random else None))
         return batch
 
     def views_of(self, step: int) -> range:

@@ -5,7 +5,7 @@ import torch
 
 from scene_experts.training.resident import Resident
 from support.captures import load
-from support.synthetic import make_capture
+from support.synthetic import make_blender, make_capture
 
 
 @pytest.fixture(scope="module")
@@ -41,3 +41,9 @@ def test_the_background_is_that_of_the_view_or_of_the_capture(capture) -> None:
     assert photographs.background(None) is photographs.background(None)
     assert torch.equal(photographs.background(None), torch.tensor(capture.background))
     assert torch.equal(photographs.background(torch.ones(3)), torch.ones(3))
+
+
+def test_transparent_photographs_keep_the_colour_that_they_lie_over(tmp_path) -> None:
+    capture = load(make_blender(tmp_path).folder, init="random")
+    assert capture.alpha_over == capture.background == (1.0, 1.0, 1.0)
+    assert torch.equal(Resident(capture, "cpu", torch.float32).background(torch.zeros(3)), torch.ones(3))

@@ -131,7 +131,7 @@ def test_a_checkpoint_of_another_recipe_in_the_folder(run):
         (RunConfig(replace(CFG, iterations=600), CONFIG.data), {"resume": True}, ["iterations", 300, 600]),
         (RunConfig(replace(CFG, loss=replace(CFG.loss, load=0.5)), CONFIG.data), {"resume": True}, ["loss.load", 0.01, 0.5]),
         (RunConfig(CFG, replace(CONFIG.data, split="first:2")), {"resume": True}, ["split", "auto", "first:2"]),
-        (RunConfig(CFG, replace(CONFIG.data, init="dense")), {"resume": True}, ["init", "points", "dense"]),
+        (RunConfig(CFG, replace(CONFIG.data, init="dense")), {"resume": True}, ["init", "auto", "dense"]),
         (RunConfig(replace(CFG, loss=replace(CFG.loss, load=float("nan"))), CONFIG.data), {"resume": False}, ["nan"]),
         (replace(CONFIG, init_from=Path("/coarse")), {"resume": True}, ["--init-from", "none", "/coarse"]),
     ],

@@ -166,3 +166,13 @@ def test_a_longer_schedule_does_not_put_a_scene_back_into_a_phase_that_it_has_le
     with pytest.raises(InputError, match=naming(flag, 600)):
         Training.start_from(longer, tmp_path, capture, "cpu", now)
     assert Training.start_from(replace(cfg, iterations=1500).scaled(), tmp_path, capture, "cpu", now).step == 600
+
+
+def test_backgrounds_are_random_after_their_iteration(capture):
+    cfg = replace(RECIPES["moe-gs"][1], random_background=True, random_background_from=15_000, iterations=3000).scaled()
+    training = Training.start(cfg, capture, "cpu")
+    assert cfg.random_background_from == 1500
+    for step, random in ((1, False), (1500, False), (1501, True), (3000, True)):
+        training.step = step
+        ((_, color),) = training.next_batch((0, 1))
+        assert (color is not None) is random

@@ -27,7 +27,6 @@ from scene_experts.data.dense.pictures import SmallPictures, reduce_pictures
 from scene_experts.data.dense.sweep import DepthMaps
 from scene_experts.data.views import Capture
 
-_OTHERWISE = "leave --init dense out"
 SIDE = 200  # px, longer side of the reduced pictures
 PLANES = 64
 COMPARED = 5  # views that a view is compared with
@@ -40,6 +39,15 @@ WANTED = 13_000  # points, or as many as the capture has if those are more
 PART = 1 / 3  # largest share of the points in holes, and of the capture's own
 MANY = 12  # pixels looked at per point that is wanted; of more, every nth is taken
 OF_CAP = 0.8  # share of the largest number of rows that the points may be, so that growth has room
+
+
+class NoDenseStartError(InputError):
+    """A capture for which no points can be computed. expected, why: What is needed and what was
+    found, as parts of a sentence."""
+
+    def __init__(self, expected: str, why: str, mend: str = "leave --init dense out") -> None:
+        super().__init__(f"expected {expected} for --init dense, found {why}; {mend}")
+        self.expected, self.why = expected, why
 
 
 @dataclass(frozen=True)
@@ -73,15 +81,16 @@ def start_densely(capture: Capture, most: int = 0) -> DenseStart:
     most: Rows at which growth stops; 0: no limit. There are at most 0.8 times as many points.
 
     Raises:
-        InputError: The capture has no points, fewer than 3 of its training views overlap, or hardly
-            any pixel has a depth; or a photograph cannot be read, or there is no compiled library.
+        NoDenseStartError: The capture has no points, fewer than 3 of its training views overlap, or
+            hardly any pixel has a depth.
+        InputError: A photograph cannot be read, or there is no compiled library.
         RunError: Memory ran out.
     """
     began = time.process_time()
     if capture.points is None or len(capture.points.xyz) == 0:
-        raise InputError("expected 3D points in the capture for --init dense, which tell how far things are, found none; use --init random")
+        raise NoDenseStartError("3D points in the capture, which tell how far things are,", "none", "use --init random")
     if len(capture.train) < FEWEST:
-        raise InputError(f"expected at least {FEWEST} training views for --init dense, found {len(capture.train)}; {_OTHERWISE}")
+        raise NoDenseStartError(f"at least {FEWEST} training views", f"{len(capture.train)}")
     own = SizedPoints.of(capture.points.xyz.double().numpy(), capture.points.rgb.numpy())
     maps = sweep_views(capture, own)
     own = clear_points(maps, own, IN_FRONT)
@@ -101,22 +110,17 @@ def start_densely(capture: Capture, most: int = 0) -> DenseStart:
 
 
 def sweep_views(capture: Capture, own: SizedPoints) -> DepthMaps:
-    """Return the confirmed depths of the training views. Raises InputError as `start_densely`."""
+    """Return the confirmed depths of the training views. Raises NoDenseStartError as `start_densely`."""
     pictures = reduce_pictures(capture, SIDE)
     pairs = choose_pairs(pictures, own.xyz, COMPARED)
     if pairs.swept < FEWEST:
-        raise InputError(
-            f"expected at least {FEWEST} training views that each overlap with two others for --init dense, found {pairs.swept}; "
-            + _OTHERWISE
-        )
+        raise NoDenseStartError(f"at least {FEWEST} training views that each overlap with two others", f"{pairs.swept} such views")
     maps = DepthMaps(pictures, pairs, PLANES)
     maps.keep_confirmed()
     swept = (pairs.planes[:, 1] > 0).repeat_interleave(pictures.start.diff())
     share = float((maps.inverse[swept] > 0).double().mean())
     if share < LEAST_DEPTH:
-        raise InputError(
-            f"expected photographs in which --init dense finds depth, found it in {100 * share:.1f} % of their pixels; {_OTHERWISE}"
-        )
+        raise NoDenseStartError("photographs that show depth", f"it in {100 * share:.1f} % of their pixels")
     return maps
 
 

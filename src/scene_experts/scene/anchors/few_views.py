@@ -14,6 +14,9 @@ Park et al., CVPR 2025).
 
 With `few_views` m, both fall linearly to nothing from m to 2 m training views: with more
 photographs, little is left to guess, and both cost sharpness.
+
+With `few_fall` (a, b), both fall linearly to nothing from iteration a to b: the last iterations
+train what is drawn afterwards, all anchors from where the cameras stand.
 """
 
 from __future__ import annotations
@@ -70,3 +73,9 @@ def find_weight(few: int, views: int) -> float:
     It falls linearly between. With few = 0 it is 1 for any number of views.
     """
     return min(1.0, max(0.0, 2.0 - views / few)) if few else 1.0
+
+
+def left_at(step: int, first: int, last: int) -> float:
+    """Return the factor of the dropout and the displacement at an iteration: 1 up to `first`, 0 from
+    `last` on, linear between. With last = 0 it is 1 at any iteration."""
+    return min(1.0, max(0.0, (last - step) / max(last - first, 1))) if last else 1.0

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from scene_experts.core.errors import InputError
-from scene_experts.core.fields import Count, CountOrNone, Flag, NotNegative, Range, Scales
+from scene_experts.core.fields import SCALES, Count, CountOrNone, Flag, NotNegative, Range, Scales
 from scene_experts.core.parts import register
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points, Routing
@@ -34,7 +34,7 @@ from scene_experts.scene.anchors import native_decode, triton_decode
 from scene_experts.scene.anchors.appearance import Codes, fold
 from scene_experts.scene.anchors.direct import DirectAnchors, explain_uncovered
 from scene_experts.scene.anchors.features import FeatureMix, OwnFeature
-from scene_experts.scene.anchors.few_views import displace, find_spacings, find_weight
+from scene_experts.scene.anchors.few_views import displace, find_spacings, find_weight, left_at
 from scene_experts.scene.anchors.frozen import Frozen, FrozenCuda
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, Attribute, Decoder, Head, HeadWeights, Plain
 from scene_experts.scene.anchors.select import AllAnchors, Selection, Selector, drop_masked, fade_opacities, visible_rows
@@ -89,6 +89,9 @@ class Anchors(SceneConfig):
     few_views: CountOrNone = 0
     """Number of training views up to which dropout and view_jitter have their whole value. Both
     fall linearly to 0 at twice as many views; 0: the same values for any number of views."""
+    few_fall: Annotated[tuple[int, int], Range(0), SCALES] = (0, 0)
+    """Iterations between which dropout and view_jitter fall linearly to nothing; 0 0: they stay.
+    --iterations rescales them."""
     smoothing: NotNegative = 0.0
     """Variance of the 3D smoothing filter in squared pixels of the closest training view (0.2 in
     Mip-Splatting); 0 means no filter. It helps cameras that come closer than the training views."""
@@ -261,11 +264,12 @@ class AnchorScene(LatticeScene):
         """Return the rows [A] that are decoded for `camera` at `step`, and the camera that they are
         decoded for."""
         seen_from, config, share = camera, self.config, 0.0
-        if config.dropout and self.few_weight and mode is Mode.TRAIN:
-            share = config.dropout * self.few_weight * min(1.0, step / config.dropout_full)
+        weight = self.few_weight * left_at(step, *config.few_fall) if mode is Mode.TRAIN else 0.0
+        if config.dropout and weight:
+            share = config.dropout * weight * min(1.0, step / config.dropout_full)
         rows = self.visible(camera, step, mode, cull, share)
-        if config.view_jitter and self.few_weight and mode is Mode.TRAIN:
-            seen_from = displace(camera, config.view_jitter * self.few_weight * self.spacings.get(camera.id, 0.0))
+        if config.view_jitter and weight:
+            seen_from = displace(camera, config.view_jitter * weight * self.spacings.get(camera.id, 0.0))
         return rows, seen_from
 
     def finish(self, decoded: Decoded, camera: Camera, step: int, mode: Mode) -> Decoded:

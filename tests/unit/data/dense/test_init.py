@@ -140,7 +140,7 @@ def test_captures_without_depth_are_refused(capture, change, words):
 
 def test_photographs_without_texture_are_refused(tmp_path):
     capture = opened(make_planes(tmp_path / "grey", hole(3.0, 50.0, 4.0)))
-    with pytest.raises(InputError, match=r"expected photographs in which --init dense finds depth, found it in 0\.0 % of their pixels"):
+    with pytest.raises(InputError, match=r"expected photographs that show depth for --init dense, found it in 0\.0 % of their pixels"):
         start_densely(capture)
     capture.images.close()
 

@@ -9,7 +9,7 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.core.fields import check_fields
 from scene_experts.core.types import Camera, Mode, Points
-from scene_experts.scene.anchors.few_views import displace, find_spacings, find_weight
+from scene_experts.scene.anchors.few_views import displace, find_spacings, find_weight, left_at
 from scene_experts.scene.anchors.scene import Anchors, AnchorScene
 from support.messages import naming
 
@@ -119,3 +119,27 @@ def test_more_views_mean_less_dropout_and_less_displacement():
 def test_refused(changes):
     with pytest.raises(InputError, match=naming("--scene." + next(iter(changes)).replace("_", "-"))):
         check_fields(Anchors(**changes), "scene")
+
+
+@pytest.mark.parametrize(("step", "expected"), [(1, 1.0), (10, 1.0), (15, 0.75), (20, 0.5), (30, 0.0), (99, 0.0)])
+def test_both_fall_to_nothing_between_two_iterations(step, expected):
+    assert left_at(step, 10, 30) == pytest.approx(expected) and left_at(step, 0, 0) == 1.0
+    assert left_at(30, 30, 30) == 0.0 and left_at(29, 30, 30) == 1.0
+    cameras = [camera(float(i), i) for i in range(3)]
+    falling = scene(Anchors(dropout=0.4, dropout_full=1, view_jitter=0.5, few_fall=(10, 30)), cameras)
+    steady = scene(Anchors(dropout=0.4 * expected, dropout_full=1, view_jitter=0.5 * expected), cameras)
+    found = []
+    for made in (falling, steady):
+        torch.manual_seed(1)
+        rows, seen_from = made.choose(cameras[0], step, Mode.TRAIN, EVERYTHING)
+        found.append((rows, seen_from.world_to_cam))
+        drawn, at = made.choose(cameras[0], step, Mode.DRAW, EVERYTHING)
+        assert len(drawn) == len(made.table) and at is cameras[0]
+    assert all(torch.equal(a, b) for a, b in zip(*found))
+
+
+def test_the_fall_is_rescaled_with_the_training():
+    from scene_experts.training.recipes import RECIPES
+
+    cfg = replace(RECIPES["scaffold-gs"][1], iterations=3000, scene=Anchors(few_fall=(15_000, 22_500)))
+    assert cfg.scaled().scene.few_fall == (1500, 2250)
