@@ -30,11 +30,29 @@ def hold_out_each(scenes: Sequence[CaptureSpec], folds: int) -> list[CaptureSpec
 def join(records: Sequence[Record], folds: int) -> list[Record]:
     """Return one record for the records of all folds of a training, with the scores of all views
     and the means of other results. Trainings without one of their folds are left out."""
+    wanted = [split_of(fold, folds) for fold in range(1, folds + 1)]
+    return [_join([by_split[split] for split in wanted]) for by_split in _by_training(records).values() if by_split.keys() >= {*wanted}]
+
+
+def find_incomplete(records: Sequence[Record], folds: int) -> list[str]:
+    """Return one line for each training that `join` leaves out: what it is, and its missing
+    folds."""
+    lines = []
+    for (scene, recipe, seed), by_split in _by_training(records).items():
+        missing = [str(fold) for fold in range(1, folds + 1) if split_of(fold, folds) not in by_split]
+        if missing:
+            lines.append(
+                f"{recipe} on {scene}, seed {seed}, is not in the tables: {len(missing)} of {folds} folds are missing ({', '.join(missing)})"
+            )
+    return lines
+
+
+def _by_training(records: Sequence[Record]) -> dict[tuple[str, str, int], dict[str, Record]]:
+    """Return the records of each training by split."""
     found: dict[tuple[str, str, int], dict[str, Record]] = {}
     for record in records:
         found.setdefault((record.scene, record.recipe, record.seed), {})[record.config.data.split] = record
-    wanted = [split_of(fold, folds) for fold in range(1, folds + 1)]
-    return [_join([by_split[split] for split in wanted]) for by_split in found.values() if all(split in by_split for split in wanted)]
+    return found
 
 
 def _join(parts: Sequence[Record]) -> Record:

@@ -124,7 +124,8 @@ class Spec:
 
     @property
     def label(self) -> str:
-        return f"{self.recipe} on {self.scene.name}, seed {self.seed}"
+        fold = f", {split.replace(':', ' ')}" if (split := self.data.split).startswith("fold:") else ""
+        return f"{self.recipe} on {self.scene.name}, seed {self.seed}{fold}"
 
     def folder(self, root: Path) -> Path:
         """Return the path of the run folder. No two configurations share one."""

@@ -12,7 +12,7 @@ from scene_experts.core.signals import handled
 from scene_experts.reproduce import report, store
 from scene_experts.reproduce.cluster import ClusterRunner
 from scene_experts.reproduce.experiments import EXPERIMENTS
-from scene_experts.reproduce.folds import join
+from scene_experts.reproduce.folds import find_incomplete, join
 from scene_experts.reproduce.options import ReproduceOptions
 from scene_experts.reproduce.plan import Spec
 from scene_experts.reproduce.request import StudyPlan, make_plan, written_command
@@ -40,7 +40,10 @@ def reproduce(options: ReproduceOptions, say: Say) -> bool:
     runner = make_runner(options, plan, say, draw)
     failures = [] if options.tables_only else run_plan(runner, plan, options.out)
     found = store.find_all(store.load(plan.records), plan.shown)
-    found = join(found, options.folds) if options.folds else found
+    if options.folds:
+        for line in find_incomplete(found, options.folds):
+            say(line)
+        found = join(found, options.folds)
     for path in report.write(options.out, plan.experiments, plan.scenes, found, written_command(options, plan.scenes)):
         say(f"wrote {path}")
     if runner.stop.is_set():

@@ -8,7 +8,7 @@ import pytest
 from scene_experts import cli
 from scene_experts.data.settings import Data
 from scene_experts.reproduce import store
-from scene_experts.reproduce.folds import hold_out_each, join
+from scene_experts.reproduce.folds import find_incomplete, hold_out_each, join
 from scene_experts.reproduce.plan import CaptureSpec
 from scene_experts.reproduce.statistics import difference
 from support.records import record
@@ -43,6 +43,9 @@ def test_the_joined_record_has_the_scores_of_all_views_and_the_means_of_the_rest
 def test_a_training_without_one_of_its_folds_is_left_out():
     whole, part, other = parts(), parts(seed=1)[:2], parts("scaffold-gs", folds=2, sizes=(2, 2))
     assert [(r.recipe, r.seed) for r in join([*whole, *part, *other], 3)] == [("moe-gs", 0)]
+    one, two = find_incomplete([*whole, *part, *other], 3)
+    assert "moe-gs on" in one and "seed 1" in one and "1 of 3 folds are missing (3)" in one
+    assert "scaffold-gs on" in two and "3 of 3 folds are missing" in two
 
 
 def test_differences_are_paired_by_all_views():

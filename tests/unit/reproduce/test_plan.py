@@ -73,7 +73,7 @@ def test_a_setting_counts_where_it_differs_from_its_default_and_a_part_where_it_
         replace(cfg, scene=replace(cfg.scene, decoder=replace(cfg.scene.decoder, router=Margin()))),
     ):
         assert identity("fox", changed, Data(FOX.path)) != name
-    assert len({identity("fox", cfg, Data(FOX.path, init=start)) for start in ("points", "dense", "random")} | {name}) == 3
+    assert len({identity("fox", cfg, Data(FOX.path, init=start)) for start in ("auto", "dense", "random")} | {name}) == 3
     monkeypatch.setattr(Linear, "changes", ("The logits are divided by two.",))
     assert identity("fox", cfg, Data(FOX.path)) != name
     plain = Spec(FOX, "scaffold-gs", 0, Scale()).train  # has no router
