@@ -17,11 +17,10 @@ def propose_training(data: Data, width: int, height: int, views: int) -> str:
     from scene_experts.api.command_line import changes, words_of
     from scene_experts.bench.advice import suggest
     from scene_experts.data.fetch.catalog import defaults_of
-    from scene_experts.training.recipes import choose_recipe
+    from scene_experts.training.recipes import PROPOSED
 
     plain = Data(data.path, resolution=data.resolution, normalise=defaults_of(data.path).normalise)
     read = [word for place, value in changes(plain, data) or [] for word in words_of(place, value)]
     advice = suggest(width, height, views)
-    recipe = choose_recipe(views)
     time = f"  # {advice}" if str(advice) else ""
-    return f"next: {shlex.join([PROG, 'train', recipe, '--data', str(data.path), '--out', 'RUN', *read, *advice.flags])}{time}"
+    return f"next: {shlex.join([PROG, 'train', PROPOSED, '--data', str(data.path), '--out', 'RUN', *read, *advice.flags])}{time}"

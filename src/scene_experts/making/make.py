@@ -25,7 +25,7 @@ from scene_experts.sfm.options import SfmOptions
 from scene_experts.sfm.reconstruct import reconstruct
 from scene_experts.training import run_folder
 from scene_experts.training.events import Stepped
-from scene_experts.training.recipes import choose_recipe
+from scene_experts.training.recipes import PROPOSED
 
 CAPTURE, RUN, PAGE, SOURCE = "capture", "run", "scene.html", "source.json"
 RECENT = 200  # iterations whose time counts as that of one at the end
@@ -145,7 +145,7 @@ class TrainingPlan:
         advice = plan_training(*self.size, views, have, slow)
         resolution = f"longest:{advice.side}" if advice.side else "auto"
         capture = load_capture(self.place, split=self.split, resolution=resolution)
-        return replace(self, capture=capture, recipe=recipe(choose_recipe(views), iterations=advice.iterations), minutes=advice.minutes)
+        return replace(self, capture=capture, recipe=recipe(PROPOSED, iterations=advice.iterations), minutes=advice.minutes)
 
 
 def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Callable[[str], None]) -> TrainingPlan:
@@ -164,7 +164,7 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
         return TrainingPlan(place, split, (0, 0), capture, begun.train, begun=True)
     whole = load_capture(place, split=split)
     lens = whole.cameras[0]
-    first = TrainingPlan(place, split, (lens.width, lens.height), whole, recipe(choose_recipe(len(whole.train_cameras))))
+    first = TrainingPlan(place, split, (lens.width, lens.height), whole, recipe(PROPOSED))
     plan = first.fit(budget.for_training(scores))
     held = f", {len(whole.test_cameras)} held out" if scores else ""
     about = "" if plan.minutes is None else f", about {max(1, round(plan.minutes))} min if the machine is not busy"

@@ -31,7 +31,10 @@ from scene_experts.training.losses import Weights
 from scene_experts.training.recipe_book import Recipe, RecipeBook
 
 EXPERTS = Experts(num=5, top_k=2, warmup=1500)
-FEW_FOR_EXPERTS = 46
+AFTER_GROWTH = (15_000, 22_500)  # iterations: the end of growth, and the middle of what follows
+FEW = 46  # training views up to which a plane sweep gives the first points
+PROPOSED = "scene-experts"
+"""The recipe that `info` and `capture` propose and `make` trains."""
 
 scaffold_gs: Train = Train(recipe="scaffold-gs", scene=Anchors(decoder=Plain()), loss=Weights(scale=0.01))
 moe_gs: Train = replace(
@@ -68,9 +71,13 @@ def _flagship(name: str, decoder: Decoder, hidden: int) -> Train:
     return replace(
         scaffold_gs,
         recipe=name,
-        scene=Anchors(hidden=hidden, decoder=decoder, dropout=0.2, view_jitter=0.5, few_views=20),
+        scene=Anchors(hidden=hidden, decoder=decoder, dropout=0.2, view_jitter=0.5, few_views=20, few_fall=AFTER_GROWTH),
         loss=Weights(scale=0.01, opacity=0.01),
         rates=Rates(networks=2.0, anneal=0.1),
+        dense_views=FEW,
+        mean_background=True,
+        random_background=True,
+        random_background_from=AFTER_GROWTH[0],
     )
 
 
@@ -150,9 +157,3 @@ OWN: dict[str, Recipe] = {
 RECIPES = RecipeBook(OWN)
 """All recipes by name: a one-sentence description and the value of each."""
 load_with(RECIPES.load)
-
-
-def choose_recipe(views: int) -> str:
-    """Return the recipe for this number of photographs: with fewer than FEW_FOR_EXPERTS,
-    `scene-experts` gives softer pictures than `scaffold-gs`."""
-    return "scaffold-gs" if views < FEW_FOR_EXPERTS else "scene-experts"

@@ -11,6 +11,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.making import make as making
 from scene_experts.making.make import make
 from scene_experts.training.events import Stepped
+from scene_experts.training.recipes import PROPOSED
 from support.messages import naming
 from support.synthetic import make_capture
 
@@ -68,7 +69,7 @@ def test_all_photographs_are_trained_on_and_a_page_is_written(capture, tmp_path,
     said = []
     made = make(capture, tmp_path / "out", say=said.append)
     (one,) = trained.made
-    assert len(one.capture.train_cameras) == 9 and one.recipe.recipe == "scaffold-gs" and one.recipe.iterations == 1000
+    assert len(one.capture.train_cameras) == 9 and one.recipe.recipe == PROPOSED and one.recipe.iterations == 1000
     assert made.page == tmp_path / "out" / "scene.html" and json.loads(made.page.read_text()) == {"refine": None, "title": "box"}
     assert (
         made.report is None

@@ -12,7 +12,7 @@ from scene_experts.core.parts import Part, find, names_of
 from scene_experts.core.plain import lean
 from scene_experts.scene.anchors.experts import Experts
 from scene_experts.training.config import Train
-from scene_experts.training.recipes import RECIPES, choose_recipe
+from scene_experts.training.recipes import PROPOSED, RECIPES
 from support.golden import recorded
 
 SOURCE = Path(scene_experts.__file__).parent
@@ -76,5 +76,5 @@ def test_no_recipe_name_steers_code_elsewhere(path):
     assert not found
 
 
-def test_few_photographs_get_the_recipe_with_the_sharper_pictures():
-    assert choose_recipe(45) == "scaffold-gs" and choose_recipe(46) == "scene-experts"
+def test_the_proposed_recipe_is_one():
+    assert PROPOSED in RECIPES and RECIPES[PROPOSED][1].recipe == PROPOSED
