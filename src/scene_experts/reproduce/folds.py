@@ -41,9 +41,8 @@ def find_incomplete(records: Sequence[Record], folds: int) -> list[str]:
     for (scene, recipe, seed), by_split in _by_training(records).items():
         missing = [str(fold) for fold in range(1, folds + 1) if split_of(fold, folds) not in by_split]
         if missing:
-            lines.append(
-                f"{recipe} on {scene}, seed {seed}, is not in the tables: {len(missing)} of {folds} folds are missing ({', '.join(missing)})"
-            )
+            which = f"{len(missing)} of {folds} folds are missing ({', '.join(missing)})"
+            lines.append(f"{recipe} on {scene}, seed {seed}, is not in the tables: {which}")
     return lines
 
 

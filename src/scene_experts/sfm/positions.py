@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 EARTH = 6_371_000.0  # m, mean radius
 NOISE = 30.0  # m; GPS is off by a few metres, so that it orders only photographs of places larger than this
@@ -58,6 +58,6 @@ def find_near(positions: NDArray[np.float64], count: int) -> list[tuple[int, int
     spread = np.quantile(np.linalg.norm(places - np.median(places, axis=0), axis=1), 0.9)
     if spread < NOISE:
         return []
-    _, near = cKDTree(places).query(places, count + 1)
+    _, near = KDTree(places).query(places, count + 1)
     pairs = {(min(i, int(j)), max(i, int(j))) for i, row in enumerate(near) for j in row if int(j) != i}
     return sorted((int(known[i]), int(known[j])) for i, j in pairs)

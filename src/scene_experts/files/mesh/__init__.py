@@ -33,8 +33,8 @@ def write(path: Path, mesh: Any, note: dict[str, Any]) -> None:
     glb = path.suffix.lower() == ".glb"
     vertices = mesh.vertices * np.array([-1.0, -1.0, 1.0]) if glb else mesh.vertices
     made = trimesh.Trimesh(vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
-    found = made.export(file_type="glb" if glb else "ply")
-    write_bytes(path, found if isinstance(found, bytes) else found.encode())
+    found: Any = made.export(file_type="glb" if glb else "ply")
+    write_bytes(path, found)
 
 
 def draw(run: Any, capture: Any, options: Options, rasterize: Any, tell: Any) -> tuple[Any, dict[str, Any]]:

@@ -112,7 +112,8 @@ def fuse(
             weight[part] += counts
         tell(min(first + _MANY, len(blocks)), len(blocks))
     shape = (-1, SIDE, SIDE, SIDE)
-    return Volume(origin, voxel, blocks, (total / np.maximum(weight, 1)).reshape(shape), weight.reshape(shape))
+    mean = (total / np.maximum(weight, 1)).astype(np.float32)
+    return Volume(origin, voxel, blocks, mean.reshape(shape), weight.reshape(shape))
 
 
 def _may_see(camera: Camera, centres: Points, radius: float) -> NDArray[np.int64]:
@@ -149,4 +150,5 @@ def sample(view: DepthView, places: Points) -> tuple[Depths, NDArray[np.bool_]]:
     a, b = (v - i).astype(np.float32), (u - j).astype(np.float32)
     four = [view.depth[i + di, j + dj] for di in (0, 1) for dj in (0, 1)]
     seen &= np.minimum.reduce(four) > 0
-    return (1 - a) * ((1 - b) * four[0] + b * four[1]) + a * ((1 - b) * four[2] + b * four[3]), seen
+    found = (1 - a) * ((1 - b) * four[0] + b * four[1]) + a * ((1 - b) * four[2] + b * four[3])
+    return found.astype(np.float32), seen
