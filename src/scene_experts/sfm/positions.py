@@ -58,6 +58,6 @@ def find_near(positions: NDArray[np.float64], count: int) -> list[tuple[int, int
     spread = np.quantile(np.linalg.norm(places - np.median(places, axis=0), axis=1), 0.9)
     if spread < NOISE:
         return []
-    _, near = KDTree(places).query(places, count + 1)
+    near = np.asarray(KDTree(places).query(places, count + 1)[1])
     pairs = {(min(i, int(j)), max(i, int(j))) for i, row in enumerate(near) for j in row if int(j) != i}
     return sorted((int(known[i]), int(known[j])) for i, j in pairs)
