@@ -45,6 +45,7 @@ FORMATS = {
     "glb": "scene_experts.files.formats.glb",
     "usd": "scene_experts.files.formats.usd",
     "html": "scene_experts.files.formats.html",
+    "live": "scene_experts.files.anchors.live",
 }
 """Name on the command line -> module that states the format as `FORMAT`."""
 
