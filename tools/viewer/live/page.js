@@ -32,13 +32,15 @@ export class Page {
     say("");
   }
 
-  // Opens the best renderer, or where the device went away another one.
+  // The graphics device went away: WebGL 2 goes on.
+  lose() {
+    say("The graphics device went away; drawing another way");
+    this.renderer = null;
+    this.open(false).then(() => say(""), (error) => say(`The scene could not be shown: ${error.message}`));
+  }
+
+  // Opens the best renderer, without `gpu` that of WebGL 2.
   async open(gpu) {
-    const lost = () => {
-      say("The graphics device went away; drawing another way");
-      this.renderer = null;
-      this.open(false).then(() => say(""), (error) => say(`The scene could not be shown: ${error.message}`));
-    };
     const makeCanvas = () => {
       document.querySelector("canvas")?.remove();
       const canvas = document.createElement("canvas");
@@ -50,6 +52,7 @@ export class Page {
       this.resize();
       return canvas;
     };
+    const lost = () => this.lose();
     this.renderer = await openRenderer(this.ask, this.settings, makeCanvas, () => this.view(), { lost, news: (error) => (error ? say(error.message) : this.wake()), gpu });
     this.wake();
   }
@@ -83,7 +86,7 @@ export class Page {
     list.setAttribute("aria-label", "places of the photographs");
     button.setAttribute("aria-expanded", "false");
     button.setAttribute("aria-controls", "list");
-    list.style.cssText = "position:fixed;left:10px;bottom:54px;max-width:min(25rem,calc(100vw - 20px));max-height:40vh;overflow:auto;background:#1c1c1cf2;border-radius:8px;padding:8px";
+    list.style.cssText = "position:fixed;left:10px;max-width:min(25rem,calc(100vw - 20px));max-height:40vh;overflow:auto;background:#1c1c1cf2;border-radius:8px;padding:8px";
     this.settings.poses.forEach((pose, i) => {
       const place = make("button", { textContent: String(i + 1), title: `fly to photograph ${i + 1}` });
       place.setAttribute("aria-label", `fly to photograph ${i + 1}`);
@@ -93,15 +96,17 @@ export class Page {
     });
     button.addEventListener("click", () => this.show("places", "list"));
     find("next").after(button);
+    find("bar").style.flexWrap = "wrap";
     find("bar").after(list);
   }
 
   // Opens or closes what a button controls; without `open`, the other one of the two.
   show(button, panel, open) {
-    const isOpen = open ?? find(panel)?.hidden;
+    const isOpen = open ?? find(panel)?.hidden, above = `${find("bar").offsetHeight + 20}px`;
     for (const [by, what] of [["ask", "help"], ["places", "list"]]) {
       if (!find(what)) continue;
       find(what).hidden = !(isOpen && what === panel);
+      find(what).style.bottom = above;
       find(by).setAttribute("aria-expanded", String(!find(what).hidden));
       if (what === "list") find(what).style.display = find(what).hidden ? "none" : "block";
     }
@@ -306,7 +311,7 @@ export class Page {
   async settled() {
     await this.loaded;
     do await new Promise((done) => setTimeout(done, 50));
-    while (this.running || !this.renderer.isFinal);
+    while (this.running || !this.renderer?.isFinal);
     return true;
   }
 }

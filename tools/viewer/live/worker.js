@@ -4,9 +4,15 @@ import { CpuDecoder, sortFarToNear } from "./decode.js";
 import { packScene } from "./pack.js";
 import { makeScene } from "./scene.js";
 
-export function bytesOf(text) {
-  if (Uint8Array.fromBase64) return Uint8Array.fromBase64(text);
-  return Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+function bytesOf(text) {
+  try {
+    if (Uint8Array.fromBase64) return Uint8Array.fromBase64(text);
+    const found = atob(text), out = new Uint8Array(found.length);
+    for (let i = 0; i < out.length; ++i) out[i] = found.charCodeAt(i);
+    return out;
+  } catch {
+    throw new Error("expected a compact file that this version reads, found text that is not base64");
+  }
 }
 
 // text: a compact file in base64.
