@@ -41,9 +41,9 @@ out vec2 uv;
 void main() { uv = vec2((gl_VertexID << 1) & 2, gl_VertexID & 2); gl_Position = vec4(2.0 * uv - 1.0, 0, 1); }`;
 const COPY_FRAGMENT = `#version 300 es
 precision highp float;
-uniform sampler2D picture; uniform vec3 background; uniform vec3 calm;
+uniform sampler2D picture; uniform vec3 background;
 in vec2 uv; out vec4 o;
-void main() { vec4 c = texture(picture, uv); o = vec4(c.rgb + (1.0 - c.a) * mix(calm, background, smoothstep(0.0, 0.5, c.a)), 1); }`;
+void main() { vec4 c = texture(picture, uv); o = vec4(c.rgb + (1.0 - c.a) * background, 1); }`;
 
 export class GlRenderer {
   // Raises an Error with a sentence where WebGL 2 is missing.
@@ -133,7 +133,6 @@ export class GlRenderer {
     gl.viewport(0, 0, gl.drawingBufferWidth, gl.drawingBufferHeight);
     gl.useProgram(copies.program);
     gl.uniform3f(copies.at("background"), ...settings.background);
-    gl.uniform3f(copies.at("calm"), ...settings.calm);
     gl.bindTexture(gl.TEXTURE_2D, this.picture);
     gl.bindVertexArray(this.nothing);
     gl.drawArrays(gl.TRIANGLES, 0, 3);

@@ -81,11 +81,10 @@ struct Out { @builtin(position) at: vec4f, @location(0) d: vec2f, @location(1) @
   if (alpha < 1.0 / 255.0) { discard; }
   return vec4f(in.color.rgb * alpha, alpha);
 }`;
-// What nothing covers fades into the calm colour.
 const COPY = `
 @group(0) @binding(0) var picture: texture_2d<f32>;
 @group(0) @binding(1) var near: sampler;
-@group(0) @binding(2) var<uniform> back: array<vec4f, 2>; // the scene's background, the calm colour
+@group(0) @binding(2) var<uniform> back: vec4f;
 struct Out { @builtin(position) at: vec4f, @location(0) uv: vec2f }
 @vertex fn vs(@builtin(vertex_index) v: u32) -> Out {
   let p = vec2f(f32((v << 1u) & 2u), f32(v & 2u));
@@ -93,7 +92,7 @@ struct Out { @builtin(position) at: vec4f, @location(0) uv: vec2f }
 }
 @fragment fn fs(in: Out) -> @location(0) vec4f {
   let c = textureSample(picture, near, in.uv);
-  return vec4f(c.rgb + (1 - c.a) * mix(back[1].rgb, back[0].rgb, smoothstep(0.0, 0.5, c.a)), 1);
+  return vec4f(c.rgb + (1 - c.a) * back.rgb, 1);
 }`;
 
 export class Gpu {
@@ -161,7 +160,7 @@ export class GpuRenderer {
     const { UNIFORM, STORAGE, INDIRECT } = GPUBufferUsage, slots = (this.slots = scene.N * scene.K);
     const anchors = gpu.buffer(scene.anchors.byteLength, scene.anchors);
     this.decoded = gpu.buffer(4 * slots * slotWords(scene.exact));
-    [this.camera, this.view, this.size, this.back] = [16, 80, 16, 32].map((size) => gpu.buffer(size, null, UNIFORM));
+    [this.camera, this.view, this.size, this.back] = [16, 80, 16, 16].map((size) => gpu.buffer(size, null, UNIFORM));
     this.heads = scene.heads.map((head) => {
       const own = [head.networks, head.perm, head.experts].map((data) => gpu.buffer(data.byteLength, data));
       const share = head.width > 1 ? [gpu.buffer(head.share.byteLength, head.share)] : [];
@@ -175,7 +174,7 @@ export class GpuRenderer {
     this.counted = gpu.compute(ARGS, [this.count, this.args]);
     this.draws = gpu.pipeline(DRAW, "rgba16float", "triangle-strip", { color: OVER, alpha: OVER });
     this.drawn = gpu.bind(this.draws, [splats, this.sorter.ids, this.size]);
-    gpu.device.queue.writeBuffer(this.back, 0, new Float32Array([...settings.background, 1, ...settings.calm, 1]));
+    gpu.device.queue.writeBuffer(this.back, 0, new Float32Array([...settings.background, 1]));
     this.context = canvas?.getContext("webgpu");
     if (!this.context) return;
     const format = navigator.gpu.getPreferredCanvasFormat();

@@ -19,8 +19,7 @@ export class Page {
     this.camera = new Camera(settings.up, settings.distance);
     this.camera.still = isCalm();
     this.veil = find("veil");
-    this.veil.style.setProperty("--back", `rgb(${settings.calm.map((v) => Math.round(255 * v))})`);
-    document.body.style.background = document.documentElement.style.background = `rgb(${settings.calm.map((v) => Math.round(255 * v))})`;
+    this.veil.style.setProperty("--back", `rgb(${settings.background.map((v) => Math.round(255 * v))})`);
     this.listen();
     this.setPose(settings.pose);
     this.readHash();
@@ -147,7 +146,7 @@ export class Page {
     event.preventDefault();
     const by = event.deltaY * (event.deltaMode === 1 ? 30 : event.deltaMode === 2 ? 300 : 1), tan = Math.tan((this.shown * Math.PI) / 360);
     const ray = [((2 * event.clientX - innerWidth) / innerHeight) * tan, ((2 * event.clientY) / innerHeight - 1) * tan, 1];
-    this.camera.ask("nearer", Math.max(-0.5, Math.min(0.5, -by / 700)), ray);
+    this.camera.ask("nearer", Math.max(-0.5, Math.min(0.5, -by / 700)), by < 0 ? ray : undefined); // away from the target, not from the pointer
     this.take();
   }
 

@@ -2,8 +2,9 @@
 
 The page holds the compact file of a scene of anchors and a script (tools/viewer/live) that decodes
 it for the position of the camera, with WebGPU, or without it with WebGL 2. The note has the entries
-that html's has, and `nearest`, the depth up to which nothing is drawn, and `calm`, the RGB colour
-in [0, 1] of what nothing covers.
+that html's has, and `nearest`, the depth up to which nothing is drawn. What nothing covers shows
+the scene's own background: trainings leave dark things transparent before it, so that another
+colour would be wrong.
 """
 
 from __future__ import annotations
@@ -24,7 +25,6 @@ from scene_experts.files.anchors import compact
 from scene_experts.files.anchors.data import AnchorData
 from scene_experts.files.anchors.quality import choose_precision
 from scene_experts.files.anchors.rounding import distance_exponent
-from scene_experts.files.anchors.sensitivity import evenly
 from scene_experts.files.formats import html
 from scene_experts.files.measure import Tell
 from scene_experts.files.options import Options
@@ -44,7 +44,6 @@ ROUTERS = {"Linear": "softmax", "Places": "softmax", "Margin": "margin", "Balanc
 LARGEST_HALF = 60_000.0  # beyond it the script holds values in 32 bits
 _KNOWN = {f"{a}.{name}" for a in ATTRIBUTES for name in ("router.weight", "router.bias", "router_balance")}
 _KNOWN |= {f"{a}.experts.{name}" for a in ATTRIBUTES for name in ("w1", "b1", "w2", "b2")} | {"appearance.table"}
-_PHOTOGRAPHS = 8  # whose mean is the calm colour
 
 
 def write(path: Path, data: AnchorData, note: dict[str, Any]) -> str:
@@ -91,7 +90,7 @@ def expect_drawable(data: AnchorData) -> None:
 def page_settings(data: AnchorData, note: Mapping[str, Any]) -> dict[str, Any]:
     """The settings of the script: `html.view_settings`, and how to decode what the file holds."""
     about, places = data.about or {}, data.columns["xyz"].double()
-    config, background = about["train"]["scene"], [float(v) for v in note.get("background", (0.0, 0.0, 0.0))]
+    config = about["train"]["scene"]
     centre = places.median(0).values if len(places) else torch.zeros(3, dtype=torch.float64)
     view = html.view_settings(places - centre, note, centre)
     for name in ("near", "far"):
@@ -101,8 +100,7 @@ def page_settings(data: AnchorData, note: Mapping[str, Any]) -> dict[str, Any]:
         "centre": centre.tolist(),
         **view,
         "nearest": float(note.get("nearest") or view["distance"] / 500),
-        "background": background,
-        "calm": [float(v) for v in note.get("calm", background)],
+        "background": [float(v) for v in note.get("background", (0.0, 0.0, 0.0))],
         "antialias": about["train"].get("antialias") is True,
         "heads": {a: _head(a, data) for a in ATTRIBUTES},
         "router": _positions(about, centre),
@@ -151,17 +149,9 @@ def _fits_halves(data: AnchorData) -> bool:
 
 
 def view_note(capture: Capture, world: World) -> dict[str, Any]:
-    """html's entries, the near plane and the mean colour of some photographs. See
-    `html.view_note`."""
-    note = html.view_note(capture, world)
-    colours = []
-    for index in evenly(capture.train, _PHOTOGRAPHS) if len(capture.images) else ():
-        frame = capture.frame(index)
-        if frame.mask is not None:  # the scene stands alone before its background
-            return note | {"nearest": capture.views[0].camera.near / world.scale}
-        colours.append(frame.rgb.double().mean((0, 1)) / 255)
-    calm = {"calm": torch.stack(colours).mean(0).tolist()} if colours else {}
-    return note | calm | ({"nearest": capture.views[0].camera.near / world.scale} if capture.views else {})
+    """html's entries and the near plane. See `html.view_note`."""
+    near = {"nearest": capture.views[0].camera.near / world.scale} if capture.views else {}
+    return html.view_note(capture, world) | near
 
 
 def fit(

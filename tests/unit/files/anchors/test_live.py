@@ -51,7 +51,7 @@ def test_a_page_holds_the_compact_file_and_is_recognised(tmp_path, case):
 def test_settings_say_how_to_decode(tmp_path):
     heads = {}
     for case in ("scene-experts", "scaffold-gs", "moe-gs", "moe-gs-dist", "moe-gs-e3-dense", "moe-gs-posrouter", "margin"):
-        write(tmp_path / "a.html", case, background=(0.1, 0.2, 0.3), calm=(0.5, 0.5, 0.5))
+        write(tmp_path / "a.html", case, background=(0.1, 0.2, 0.3))
         found = settings_of(tmp_path / "a.html")
         heads[case] = [found["heads"]["cov"][name] for name in ("k", "alone", "weigh", "position", "distance")]
     assert heads == {
@@ -63,7 +63,7 @@ def test_settings_say_how_to_decode(tmp_path):
         "moe-gs-posrouter": [2, None, "softmax", True, 1.0],
         "margin": [2, None, "margin", False, 1.0],
     }
-    assert found["background"] == [0.1, 0.2, 0.3] and found["calm"] == [0.5, 0.5, 0.5] and found["nearest"] == 0.004
+    assert found["background"] == [0.1, 0.2, 0.3] and found["nearest"] == 0.004
     assert found["exact"] is False and found["levels"] is None and len(found["poses"]) == 1
 
 
