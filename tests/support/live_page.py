@@ -54,10 +54,12 @@ _BYTES = """(array) => {
 
 
 class LivePage:
-    """A tab with a live page. errors: what its console says; requests: what it asks for."""
+    """A tab with a live page. change: a script that runs before the page's. errors: what its console says; requests: what it asks for."""
 
-    def __init__(self, tab: Any) -> None:
+    def __init__(self, tab: Any, change: str = "") -> None:
         self.tab, self.errors, self.requests = tab, [], []
+        if change:
+            tab.add_init_script(change)
         tab.on("pageerror", lambda error: self.errors.append(str(error)))
         tab.on("console", lambda message: self.errors.append(message.text) if message.type == "error" else None)
         tab.on("request", lambda request: self.requests.append(request.url))
@@ -111,11 +113,11 @@ def browsers(flags: list[str], width: int, height: int) -> Iterator[Any]:
     with sync_playwright() as p:
         browser = p.chromium.launch(executable_path=CHROMIUM, args=flags)
 
-        def make() -> LivePage:
+        def make(change: str = "") -> LivePage:
             tab = browser.new_page(viewport={"width": width, "height": height})
             if flags is GPU:
                 tab.add_init_script(_STAND_IN)
-            return LivePage(tab)
+            return LivePage(tab, change)
 
         yield make
         browser.close()

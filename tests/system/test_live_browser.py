@@ -128,6 +128,38 @@ def test_the_sort_is_stable_at_the_edges_of_its_blocks_and_frames_are_cheap(tmp_
         assert page.tab.evaluate(counts)[2] == moved[2]
 
 
+WRONG = """
+const real = GPUDevice.prototype.createShaderModule;
+GPUDevice.prototype.createShaderModule = function (given) {
+  return real.call(this, { code: given.code.replaceAll(%s) });
+};
+"""
+SMALL = """
+const real = GPU.prototype.requestAdapter;
+GPU.prototype.requestAdapter = async function () {
+  return { limits: { maxBufferSize: 4096, maxStorageBufferBindingSize: 4096 }, requestDevice: () => { throw new Error("not asked for"); } };
+};
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (WRONG % '"tanh(", "0.9 * tanh("', "decodes other opacities"),
+        (WRONG % '"(keys[i] >> shift)", "(keys[i] >> (shift / 2u))"', "does not sort"),
+        (SMALL, "The scene needs 1 MB in one piece"),
+    ],
+    ids=["wrong numbers", "wrong order", "little memory"],
+)
+def test_a_device_that_is_wrong_or_small_is_left_aside(tmp_path, change, why):
+    _, settings = write(tmp_path / "a.html", "scaffold-gs")
+    with browsers(GPU, WIDTH, HEIGHT) as make:
+        page = make(change).open(tmp_path / "a.html")
+        assert page.renderer == "WebGL 2" and why in page.tab.evaluate("sceneExperts.page.renderer.why") and page.said == ""
+        go(page, settings["poses"][0])
+        assert page.picture(BACKGROUND).std() > 0.05
+
+
 def test_a_device_that_goes_away_is_replaced(tmp_path):
     """WebGL 2 goes on where WebGPU ended."""
     _, settings = write(tmp_path / "a.html", "scaffold-gs")

@@ -48,11 +48,14 @@ export class CpuDecoder {
     this.color = new Float32Array(3 * N * K);
   }
 
-  // Decodes all anchors for a position of the camera into opacity, cov and color; dead Gaussians have opacity 0.
-  decode(position) {
+  // Decodes all anchors, or those of a set, for a position of the camera into opacity, cov and color; dead Gaussians have opacity 0.
+  decode(position, only) {
     for (const head of this.heads) {
       const { count, width, perm, experts, share } = head.groups;
-      for (let i = 0; i < count * GROUP; ++i) if (perm[i] !== NONE) this.anchor(head, perm[i], position, experts, share, Math.floor(i / GROUP) * width, i * width, width);
+      for (let i = 0; i < count * GROUP; ++i) {
+        if (perm[i] === NONE || (only && !only.has(perm[i]))) continue;
+        this.anchor(head, perm[i], position, experts, share, Math.floor(i / GROUP) * width, i * width, width);
+      }
     }
   }
 

@@ -137,9 +137,14 @@ export class Gpu {
     const fragment = { module, targets: [{ format, blend }] };
     return this.device.createRenderPipeline({ layout: "auto", vertex: { module }, primitive: { topology }, fragment });
   }
-  async read(buffer, size = buffer.size) {
-    const to = this.device.createBuffer({ size, usage: GPUBufferUsage.MAP_READ | GPUBufferUsage.COPY_DST }), encoder = this.device.createCommandEncoder();
-    encoder.copyBufferToBuffer(buffer, 0, to, 0, size);
+  read(buffer, size = buffer.size) {
+    return this.gather(buffer, [0], size);
+  }
+  // The pieces of a buffer that begin at `places`, each of `size` bytes, one after the other.
+  async gather(buffer, places, size) {
+    const usage = GPUBufferUsage.MAP_READ | GPUBufferUsage.COPY_DST, encoder = this.device.createCommandEncoder();
+    const to = this.device.createBuffer({ size: Math.max(16, size * places.length), usage });
+    places.forEach((place, i) => encoder.copyBufferToBuffer(buffer, place, to, i * size, size));
     this.device.queue.submit([encoder.finish()]);
     await to.mapAsync(GPUMapMode.READ);
     const out = to.getMappedRange().slice(0);

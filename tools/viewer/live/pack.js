@@ -19,10 +19,11 @@ function put(words, at, values, exact) {
 }
 const wordsOf = (count, exact) => (exact ? count : Math.ceil(count / 2));
 
-// Where things are in the record of an anchor, in words: place, values (feature, 6 sizes, 3 K offsets), masks, further columns.
+// Where things are in the record of an anchor, in words: place, values (feature, 6 sizes, 3 K offsets), masks, level and its share, interval.
 export function layout(scene, exact) {
   const values = scene.F + 6 + 3 * scene.K, masks = 3 + wordsOf(values, exact), further = masks + Math.ceil(scene.K / 32);
-  return { values, masks, further, words: further + (scene.levels || scene.smoothing ? 3 : 0) };
+  const interval = further + (scene.levels ? 2 : 0);
+  return { values, masks, further, interval, words: interval + (scene.smoothing ? 1 : 0) };
 }
 
 // The unit of sizes, a power of two near their median: halves hold them then in any unit of lengths.
@@ -41,10 +42,9 @@ export function packAnchors(scene, unit, exact) {
     row.set(scene.offsets.subarray(3 * K * i, 3 * K * (i + 1)), F + 6);
     put(out, at + 3, row, exact);
     for (let s = 0; s < K; ++s) if (!scene.live || scene.live[s][i]) out[at + l.masks + (s >> 5)] |= 1 << (s & 31);
-    if (l.words === l.further) continue;
-    place[at + l.further] = scene.level[i];
-    place[at + l.further + 1] = scene.extra.extra_level ? scene.extra.extra_level[i] : 0;
-    place[at + l.further + 2] = scene.extra.interval ? scene.extra.interval[i] / unit : 0;
+    if (scene.levels) place[at + l.further] = scene.level[i];
+    if (scene.levels && scene.extra.extra_level) place[at + l.further + 1] = scene.extra.extra_level[i];
+    if (scene.smoothing) place[at + l.interval] = scene.extra.interval[i] / unit;
   }
   return out;
 }

@@ -2,6 +2,7 @@
 import { add, length } from "./camera.js";
 import { GlRenderer } from "./gl.js";
 import { Gpu, GpuRenderer } from "./gpu.js";
+import { probe } from "./probe.js";
 
 const STALE = 0.01; // of the distance to the scene's middle: a camera that moved less is drawn with the last decode
 
@@ -23,6 +24,7 @@ class OnGpu {
     const found = errors.find(Boolean);
     if (found) throw new Error(found.message.split("\n")[0] || "there is not enough graphics memory");
     await drawn;
+    await probe(made.renderer, ask, made.at);
     return made;
   }
   constructor(renderer, settings) {

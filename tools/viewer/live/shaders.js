@@ -73,14 +73,14 @@ const STORE = {
     for (var i = 0u; i < 3u; i++) { decoded[s + i] = bitcast<u32>(m[i]); }
     putOpacity(s, max(result(k), 0.0) * there * fade);
   }`,
-  cov: ({ K, F }, { further }, words, scene) => `
+  cov: ({ K, F }, { interval }, words, scene) => `
   let size = vec3f(value(row, ${F + 3}u), value(row, ${F + 4}u), value(row, ${F + 5}u));
   for (var k = 0u; k < ${K}u; k++) {
     let s = (anchor * ${K}u + k) * ${words}u; let o = 7u * k;
     if (opacityOf(s) <= 0.0) { continue; }
     var z = size / (1.0 + exp(-vec3f(result(o), result(o + 1u), result(o + 2u))));
     let q = vec4f(result(o + 3u), result(o + 4u), result(o + 5u), result(o + 6u));
-    ${scene.smoothing ? `let t = bitcast<f32>(anchors[row + ${further + 2}u]); let w = sqrt(z * z + f32(${scene.smoothing}) * t * t);
+    ${scene.smoothing ? `let t = bitcast<f32>(anchors[row + ${interval}u]); let w = sqrt(z * z + f32(${scene.smoothing}) * t * t);
     let part = z / w; putOpacity(s, opacityOf(s) * part.x * part.y * part.z); z = w;` : ""}
     putShape(s, z, q / max(length(q), 1e-12));
   }`,

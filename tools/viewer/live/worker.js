@@ -45,6 +45,19 @@ export function serve(scope) {
       words = decoder.pack();
       return { words: words.slice(), ids: sortFarToNear(words, row, near) };
     },
+    // what probe.js compares with
+    probe: ({ position, anchors }) => {
+      const own = new CpuDecoder(scene), { K } = scene;
+      own.decode(position, new Set(anchors));
+      const wanted = new Float32Array(7 * K * anchors.length), size = anchors.reduce((most, i) => Math.max(most, scene.size[6 * i]), 0);
+      anchors.forEach((i, j) => {
+        for (let k = 0; k < K; ++k) {
+          const s = i * K + k, mean = [0, 1, 2].map((a) => own.mean(i, k, a));
+          wanted.set([...mean, own.opacity[s], ...own.color.subarray(3 * s, 3 * s + 3)], 7 * (j * K + k));
+        }
+      });
+      return { wanted, size };
+    },
     sort: ({ row, near }) => ({ ids: sortFarToNear(words, row, near) }),
   };
   scope.onmessage = async ({ data: { number, act, given } }) => {
