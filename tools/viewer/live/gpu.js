@@ -115,7 +115,7 @@ export class Gpu {
     device.addEventListener("uncapturederror", (event) => this.errors.push(event.error.message));
   }
   buffer(size, data, usage = GPUBufferUsage.STORAGE) {
-    const bytes = Math.max(16, 16 * Math.ceil(size / 16)), also = GPUBufferUsage.COPY_DST | GPUBufferUsage.COPY_SRC;
+    const bytes = Math.max(64, 16 * Math.ceil(size / 16)), also = GPUBufferUsage.COPY_DST | GPUBufferUsage.COPY_SRC;
     const made = this.device.createBuffer({ size: bytes, usage: usage | also });
     if (data) this.device.queue.writeBuffer(made, 0, data);
     this.bytes += bytes;

@@ -17,6 +17,15 @@ class OnGpu {
     const scene = await ask("pack", { exact: settings.exact === true });
     const gpu = await Gpu.open(GpuRenderer.largest(scene), lost);
     if (!gpu) return null;
+    try {
+      return await OnGpu.begin(gpu, scene, ask, settings, canvas, view);
+    } catch (error) {
+      gpu.device.destroy();
+      throw error;
+    }
+  }
+  // Draws a first view, and checks it.
+  static async begin(gpu, scene, ask, settings, canvas, view) {
     const kinds = ["validation", "out-of-memory", "internal"];
     kinds.forEach((kind) => gpu.device.pushErrorScope(kind));
     const made = new OnGpu(new GpuRenderer(gpu, scene, settings, canvas), settings);
