@@ -20,6 +20,13 @@ WIDTH, HEIGHT = 320, 240
 PLACES = ((0.3, -0.4, -1.0), (2.5, 0.5, 0.0), (-3.0, 1.0, 2.0), (0.5, -2.0, 9.0))
 SEEN = [look(place, width=WIDTH, height=HEIGHT) for place in PLACES]
 BACKGROUND = (0.2, 0.3, 0.5)
+ROUTED = (
+    "scaffold-gs",
+    "moe-gs",
+    "moe-gs-posrouter",
+    "moe-gs-balance",
+    "margin",
+)  # differ in the worker alone, see unit/files/anchors/test_live.py
 
 
 def write(path, case, **note):
@@ -65,7 +72,7 @@ def test_pictures_are_those_of_our_rasteriser(tmp_path, flags):
             page.tab.close()
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [case for case in CASES if case not in ROUTED])
 def test_webgpu_decodes_as_python_does(tmp_path, case):
     """With values of 32 bits: every kind of routing and network, levels, codes, masks and the smoothing filter."""
     path = tmp_path / "a.html"
