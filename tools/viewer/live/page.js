@@ -7,6 +7,7 @@ const JUMP = 0.9; // seconds from one place to another
 const REST = 250; // milliseconds without news until the picture is final
 const SLOW = 40, QUICK = 18, LEAST = 0.35; // milliseconds of a frame that lower and raise the resolution; its smallest share
 const WIDEST = 100; // degrees
+const LARGEST = 4096; // pixels of a side of the picture
 
 const find = (id) => document.getElementById(id);
 export const say = (text) => ((find("note").textContent = text), (find("note").hidden = !text));
@@ -226,7 +227,7 @@ export class Page {
 
   resize() {
     if (!this.canvas) return;
-    const ratio = Math.min(devicePixelRatio, 2);
+    const ratio = Math.min(devicePixelRatio, 2, LARGEST / Math.max(innerWidth, innerHeight));
     this.canvas.width = Math.max(1, Math.round(innerWidth * ratio));
     this.canvas.height = Math.max(1, Math.round(innerHeight * ratio));
     this.canvas.style.cssText = "width:100vw;height:100vh";
