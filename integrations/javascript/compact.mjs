@@ -3,8 +3,9 @@
 //
 //   const scene = await readCompact(bytes);   // bytes: Uint8Array
 //
-// returns {header, cells, lattice, groups, networks, exact, checksum}: the whole numbers of the file in coding order. A value of a group is
-// number * header.steps[group][channel] * 2 ** class, without the class in the group "extra"; a weight is number * 2 ** (exponent / 2).
+// returns {header, cells, lattice, groups, networks, exact, checksum}: the whole numbers of the file in coding order; cells are [N, 3] in one
+// array. A value of a group is number * header.steps[group][channel] * 2 ** class, without the class in the group "extra"; a weight is
+// number * 2 ** (exponent / 2).
 // Throws an Error for files that it does not read, and where the checksum of the numbers differs.
 
 const BITS = 15, WHOLE = 1 << BITS, LANES = 4, FLOOR = 65536, HALF = 40, SYMBOLS = 82, TOP = 127;
@@ -36,16 +37,20 @@ function tail(u) {
   const e = power(u);
   return Math.floor((e * SHARE) / (ONE + e));
 }
-function makeTable(scale, phase) {
-  const slope = SLOPES[scale & 7] >> (scale >> 3);
+const rows = new Uint16Array(48 * 8 * (SYMBOLS + 1)), starts = new Uint8Array(48 * 8 * 64), made = new Uint8Array(48 * 8);
+// Fills row `at` of the tables; starts has the last entry that begins at or below each 64th of the places.
+function makeTable(scale, phase, at) {
+  const slope = SLOPES[scale & 7] >> (scale >> 3), from = at * (SYMBOLS + 1);
   const below = (t) => (t <= 0 ? tail(-t * slope) : SHARE - tail(t * slope));
-  const row = new Uint16Array(SYMBOLS + 1), first = below(-8 * HALF - phase);
-  for (let s = 0; s < SYMBOLS; ++s) row[s] = s + Math.floor(((below(8 * (s - HALF) - phase) - first) * (WHOLE - SYMBOLS)) / SHARE);
-  row[SYMBOLS] = WHOLE;
-  return row;
+  const first = below(-8 * HALF - phase);
+  for (let s = 0; s < SYMBOLS; ++s) rows[from + s] = s + Math.floor(((below(8 * (s - HALF) - phase) - first) * (WHOLE - SYMBOLS)) / SHARE);
+  rows[from + SYMBOLS] = WHOLE;
+  for (let part = 0, entry = 0; part < 64; ++part) {
+    while (rows[from + entry + 1] <= part * 512) ++entry;
+    starts[64 * at + part] = entry;
+  }
+  made[at] = 1;
 }
-const tables = new Array(48 * 8);
-const table = (scale, phase) => (tables[8 * scale + phase] ??= makeTable(scale, phase));
 const zeros = Array.from({ length: TOP + 1 }, (_, odds) => {
   const least = tail(Math.abs(odds - 64) * 2 ** 23);
   return 1 + Math.floor(((odds <= 64 ? SHARE - least : least) * (WHOLE - 2)) / SHARE);
@@ -56,8 +61,8 @@ const zeros = Array.from({ length: TOP + 1 }, (_, odds) => {
 class Reader {
   constructor(bytes) {
     if (bytes.length % 2 || bytes.length < 4 * LANES) fail("a stream that is cut short");
-    this.words = Uint16Array.from({ length: bytes.length / 2 }, (_, i) => bytes[2 * i] | (bytes[2 * i + 1] << 8));
-    this.state = Array.from({ length: LANES }, (_, i) => this.words[2 * i] + this.words[2 * i + 1] * 65536);
+    this.words = new Uint16Array(bytes.slice().buffer);
+    this.state = new Uint32Array(this.words.slice(0, 2 * LANES).buffer);
     if (this.state.some((x) => x < FLOOR)) fail("a stream with a wrong start");
     this.at = 2 * LANES;
     this.operations = 0;
@@ -68,7 +73,7 @@ class Reader {
   take(start, width) {
     const lane = this.operations++ & 3;
     let x = this.state[lane];
-    x = width * Math.floor(x / WHOLE) + (x & (WHOLE - 1)) - start; // below 2^32
+    x = width * (x >>> BITS) + (x & (WHOLE - 1)) - start; // below 2^32
     if (x < FLOOR) {
       if (this.at >= this.words.length) fail("a stream that is cut short");
       x = x * 65536 + this.words[this.at++];
@@ -89,25 +94,33 @@ class Reader {
     mean = clamp(mean, -(1 << 28), 1 << 28);
     scale = clamp(scale, 0, TOP);
     const centre = (mean + 4) >> 3, low = scale < 48 ? 0 : ((scale - 48) >> 3) + 1;
-    const row = table(scale - 8 * low, low ? 4 : mean - 8 * centre + 4), place = this.place();
-    let entry = 0;
-    for (let step = 64; step; step >>= 1) if (entry + step < SYMBOLS && row[entry + step] <= place) entry += step;
-    this.take(row[entry], row[entry + 1] - row[entry]);
-    let symbol = entry - HALF;
-    if (entry === SYMBOLS - 1) {
-      const form = this.raw(7);
-      let left = form >> 1, beyond = 1;
-      if (left > 32) fail("a number of too many bits");
-      while (left > 0) {
-        const part = Math.min(left, BITS);
-        left -= part;
-        beyond = beyond * 2 ** part + this.raw(part);
-      }
-      symbol = form & 1 ? -(beyond + HALF) : beyond + HALF;
-    }
-    const value = centre + (low ? symbol * 2 ** low + this.raw(low) - ((1 << low) >> 1) : symbol);
+    const table = 8 * (scale - 8 * low) + (low ? 4 : mean - 8 * centre + 4);
+    if (!made[table]) makeTable(scale - 8 * low, low ? 4 : mean - 8 * centre + 4, table);
+    const place = this.place(), from = table * (SYMBOLS + 1);
+    let entry = starts[64 * table + (place >> 9)];
+    while (rows[from + entry + 1] <= place) ++entry;
+    this.take(rows[from + entry], rows[from + entry + 1] - rows[from + entry]);
+    if (entry === SYMBOLS - 1) return this.escape(centre, low);
+    return low ? this.widen(centre, entry - HALF, low) : centre + entry - HALF;
+  }
+  widen(centre, symbol, low) {
+    const value = centre + symbol * 2 ** low + this.raw(low) - ((1 << low) >> 1);
     if (value < -(2 ** 31) || value >= 2 ** 31) fail("a number of too many bits");
     return value;
+  }
+  escape(centre, low) {
+    const form = this.raw(7);
+    let left = form >> 1, beyond = 1;
+    if (left > 32) fail("a number of too many bits");
+    while (left > 0) {
+      const part = Math.min(left, BITS);
+      left -= part;
+      beyond = beyond * 2 ** part + this.raw(part);
+    }
+    const symbol = form & 1 ? -(beyond + HALF) : beyond + HALF;
+    if (low) return this.widen(centre, symbol, low);
+    if (centre + symbol < -(2 ** 31) || centre + symbol >= 2 ** 31) fail("a number of too many bits");
+    return centre + symbol;
   }
   symbols(count, scale, mean = 0) {
     const out = new Int32Array(count);
@@ -121,92 +134,112 @@ class Reader {
 
 // ---- Cells ------------------------------------------------------------------------------------------------------------------------------
 
+const ONES = Uint8Array.from({ length: 256 }, (_, mask) => mask.toString(2).replaceAll("0", "").length);
+
+// The cells of an octree, [count, 3]. A node has its place, its neighbours across six faces (-1: none) and its children as bits.
 function readCells(reader, depth, count) {
-  const counts = new Map();
-  let nodes = [[0, 0, 0]], beside = [[-1, -1, -1, -1, -1, -1]];
+  const zero = new Uint16Array(2048), one = new Uint16Array(2048);
+  let n = 1, nodes = new Int32Array(3), beside = new Int32Array(6).fill(-1);
   for (let level = 0; level < depth; ++level) {
-    const children = new Uint8Array(nodes.length), first = [], next = [];
-    const left = Math.min(depth - 1 - level, 3);
-    nodes.forEach(([x, y, z], i) => {
-      first.push(next.length);
+    const children = new Uint8Array(n), first = new Int32Array(n + 1), left = Math.min(depth - 1 - level, 3);
+    for (let i = 0; i < n; ++i) {
       let own = 0;
       for (let b = 0; b < 8; ++b) {
-        let one = b === 7 && !own ? 1 : 0;
-        if (!one) {
-          let state = 0;
-          for (let a = 0; a < 3; ++a) {
-            const high = (b >> a) & 1, other = b ^ (1 << a), node = beside[i][2 * a + high];
-            state = 4 * state + (high ? 2 * ((own >> other) & 1) + (node >= 0) : node < 0 ? 0 : 1 + ((children[node] >> other) & 1));
-          }
-          const key = (left * 8 + b) * 64 + state;
-          let seen = counts.get(key);
-          if (!seen) counts.set(key, (seen = [0, 0]));
-          one = reader.bit(clamp(Math.floor(((2 * seen[0] + 1) * WHOLE) / (2 * (seen[0] + seen[1]) + 2)), 32, WHOLE - 32));
-          seen[one] += 1;
-          if (seen[0] + seen[1] > 1023) seen.forEach((n, k) => (seen[k] = (n + 1) >> 1));
+        if (b === 7 && !own) {
+          own = 128;
+          continue;
         }
-        if (one) {
-          own |= 1 << b;
-          next.push([2 * x + (b & 1), 2 * y + ((b >> 1) & 1), 2 * z + (b >> 2)]);
+        let state = 0;
+        for (let a = 0; a < 3; ++a) {
+          const high = (b >> a) & 1, other = b ^ (1 << a), node = beside[6 * i + 2 * a + high];
+          state = 4 * state + (high ? 2 * ((own >> other) & 1) + (node >= 0 ? 1 : 0) : node < 0 ? 0 : 1 + ((children[node] >> other) & 1));
         }
+        const key = (left * 8 + b) * 64 + state, share = Math.floor(((2 * zero[key] + 1) * WHOLE) / (2 * (zero[key] + one[key]) + 2));
+        const found = reader.bit(clamp(share, 32, WHOLE - 32));
+        own |= found << b;
+        if (found) one[key] += 1;
+        else zero[key] += 1;
+        if (zero[key] + one[key] > 1023) (zero[key] = (zero[key] + 1) >> 1), (one[key] = (one[key] + 1) >> 1);
       }
       children[i] = own;
-      if (next.length > count) fail("more cells than there are");
-    });
-    const ones = (mask) => {
-      let n = 0;
-      for (; mask; mask &= mask - 1) ++n;
-      return n;
-    };
-    const child = (node, b) => (node < 0 || !((children[node] >> b) & 1) ? -1 : first[node] + ones(children[node] & ((1 << b) - 1)));
-    const around = [];
-    for (let i = 0; i < nodes.length; ++i)
+      first[i + 1] = first[i] + ONES[own];
+      if (first[i + 1] > count) fail("more cells than there are");
+    }
+    const next = new Int32Array(3 * first[n]), around = new Int32Array(6 * first[n]);
+    const child = (node, b) => (node < 0 || !((children[node] >> b) & 1) ? -1 : first[node] + ONES[children[node] & ((1 << b) - 1)]);
+    for (let i = 0, at = 0; i < n; ++i)
       for (let b = 0; b < 8; ++b)
         if ((children[i] >> b) & 1) {
-          const six = [];
-          for (let a = 0; a < 3; ++a)
-            for (let up = 0; up < 2; ++up) six.push(child(((b >> a) & 1) !== up ? i : beside[i][2 * a + up], b ^ (1 << a)));
-          around.push(six);
+          for (let a = 0; a < 3; ++a) {
+            const high = (b >> a) & 1, other = b ^ (1 << a);
+            next[3 * at + a] = 2 * nodes[3 * i + a] + high;
+            for (let up = 0; up < 2; ++up) around[6 * at + 2 * a + up] = child(high !== up ? i : beside[6 * i + 2 * a + up], other);
+          }
+          ++at;
         }
+    n = first[n];
     nodes = next;
     beside = around;
   }
-  if (nodes.length !== count) fail("another number of cells");
+  if (n !== count) fail("another number of cells");
   return nodes;
 }
 
-// The bit of the highest axis in which two cells differ decides, z before y before x.
-function compareMorton(p, q) {
-  let axis = 2, most = p[2] ^ q[2];
-  for (const a of [1, 0]) {
-    const found = p[a] ^ q[a];
+// The bit of the highest axis in which two cells of `fine` differ decides, z before y before x.
+function compareMorton(fine, i, j) {
+  let axis = 2, most = fine[3 * i + 2] ^ fine[3 * j + 2];
+  for (let a = 1; a >= 0; --a) {
+    const found = fine[3 * i + a] ^ fine[3 * j + a];
     if (most < found && most < (most ^ found)) (axis = a), (most = found);
   }
-  return p[axis] - q[axis];
+  return fine[3 * i + axis] - fine[3 * j + axis];
 }
 
 // Whether two cells are in the same box of the curve, which leaves out the last `bits` bits of keys.
-function sameBox(p, q, bits) {
-  const whole = Math.floor(bits / 3), rest = bits % 3;
-  return [0, 1, 2].every((a) => p[a] >> (whole + (a < rest)) === q[a] >> (whole + (a < rest)));
+function sameBox(fine, i, j, bits) {
+  for (let a = 0; a < 3; ++a) {
+    const out = Math.floor(bits / 3) + (a < bits % 3 ? 1 : 0);
+    if (fine[3 * i + a] >> out !== fine[3 * j + a] >> out) return false;
+  }
+  return true;
 }
 
+// Rows [n, 3] of an array, by their numbers.
+function pick(from, rows, Kind) {
+  const out = new Kind(3 * rows.length);
+  for (let i = 0; i < rows.length; ++i) for (let a = 0; a < 3; ++a) out[3 * i + a] = from[3 * rows[i] + a];
+  return out;
+}
+
+// Cells, lattices and fine cells of all anchors, along the curve.
 function readPlaces(header, reader) {
-  const places = [];
-  header.lattices.forEach(([, , multiple, low, count, distinct, depth], lattice) => {
+  const N = header.N;
+  let own = new Float64Array(3 * N), lattice = new Uint8Array(N), wide = new Float64Array(3 * N), at = 0;
+  header.lattices.forEach(([, , multiple, low, count, distinct, depth], number) => {
     const found = readCells(reader, depth, distinct);
     const more = distinct < count ? reader.symbols(distinct, STEP) : new Int32Array(distinct);
-    found.forEach((cell, i) => {
-      const own = cell.map((v, a) => v + low[a]);
-      for (let k = 0; k <= more[i]; ++k) places.push({ own, lattice, fine: own.map((v) => v * multiple) });
-    });
+    for (let i = 0; i < distinct; ++i)
+      for (let k = 0; k <= more[i]; ++k, ++at) {
+        if (at >= N) fail("another number of anchors");
+        for (let a = 0; a < 3; ++a) wide[3 * at + a] = (own[3 * at + a] = found[3 * i + a] + low[a]) * multiple;
+        lattice[at] = number;
+      }
   });
   reader.finish();
-  if (places.length !== header.N) fail("another number of anchors");
-  const corner = [0, 1, 2].map((a) => places.reduce((least, p) => Math.min(least, p.fine[a]), Infinity));
-  for (const p of places) p.fine = p.fine.map((v, a) => v - corner[a]);
-  if (header.lattices.length > 1) places.sort((p, q) => compareMorton(p.fine, q.fine) || p.lattice - q.lattice);
-  return places;
+  if (at !== N) fail("another number of anchors");
+  let fine = new Int32Array(3 * N);
+  for (let a = 0; a < 3; ++a) {
+    let corner = Infinity;
+    for (let i = 0; i < N; ++i) corner = Math.min(corner, wide[3 * i + a]);
+    for (let i = 0; i < N; ++i) fine[3 * i + a] = wide[3 * i + a] - corner;
+  }
+  if (header.lattices.length > 1) {
+    const order = Int32Array.from({ length: N }, (_, i) => i).sort((i, j) => compareMorton(fine, i, j) || lattice[i] - lattice[j] || i - j);
+    own = pick(own, order, Float64Array);
+    fine = pick(fine, order, Int32Array);
+    lattice = Uint8Array.from(order, (i) => lattice[i]);
+  }
+  return { own, lattice, fine };
 }
 
 // ---- Models -----------------------------------------------------------------------------------------------------------------------------
@@ -257,40 +290,78 @@ function shifted(sum, shift) {
   return clamp(sum, -(LARGEST >> -shift), LARGEST >> -shift) * 2 ** -shift;
 }
 
-function findParents(cells, curve, level) {
-  // curve: coding place of each anchor along the curve; level: of each anchor along the curve
-  const parents = new Array(curve.length);
-  for (let own = 0; own < LEVELS; ++own) {
+// Four parents of each anchor in coding order, and their weights, [N, 4] each. curve: coding place of each anchor along the curve.
+function findParents(fine, curve, level) {
+  const found = new Int32Array(4 * curve.length), weights = new Int32Array(4 * curve.length);
+  for (let own = 1; own < LEVELS; ++own) {
     const coarse = [];
-    level.forEach((l, i) => l < own && coarse.push(i));
-    let at = 0;
-    level.forEach((l, i) => {
-      if (l !== own) return;
+    for (let i = 0; i < level.length; ++i) if (level[i] < own) coarse.push(i);
+    for (let i = 0, at = 0; i < level.length; ++i) {
+      if (level[i] !== own) continue;
       while (at < coarse.length && coarse[at] < i) ++at;
-      const found = [], share = [];
-      for (let j = at - 2; j < at + 2; ++j) {
-        const there = j >= 0 && j < coarse.length, other = there ? coarse[j] : 0;
-        found.push(curve[other]);
-        const away = [0, 1, 2].reduce((sum, a) => sum + Math.abs(cells[i][a] - cells[other][a]), 1);
-        share.push(there ? Math.floor(65536 / away) : 0);
+      const to = 4 * curve[i];
+      let total = 0;
+      for (let j = 0; j < 4; ++j) {
+        const k = at - 2 + j, there = k >= 0 && k < coarse.length, other = there ? coarse[k] : 0;
+        let away = 1;
+        for (let a = 0; a < 3; ++a) away += Math.abs(fine[3 * i + a] - fine[3 * other + a]);
+        found[to + j] = curve[other];
+        total += weights[to + j] = there ? Math.floor(65536 / away) : 0;
       }
-      const total = share.reduce((a, b) => a + b);
-      parents[curve[i]] = [found, share.map((s) => (total ? Math.floor((s * 256) / total) : 0))];
-    });
+      for (let j = 0; j < 4; ++j) weights[to + j] = total ? Math.floor((weights[to + j] * 256) / total) : 0;
+    }
   }
-  return parents;
+  return { found, weights };
 }
 
-function fillInputs(inputs, at, g, level, i, values, columns, parents) {
-  for (let l = 0; l < LEVELS; ++l) inputs[at++] = l === level ? UNIT : 0;
-  if (g.steps) for (let k = 0; k < CLASSES; ++k) inputs[at++] = k + LOW_CLASS === values.class[0][i] ? UNIT : 0;
-  for (const name of g.own) for (const column of columns[name]) inputs[at++] = column[i];
-  if (!g.parents) return;
-  const [found, weights] = parents[i];
+// The inputs [end - begin, width] of a group's anchors, without those of its chain.
+function makeInputs(g, width, level, begin, end, values, columns, parents) {
+  const inputs = new Int16Array(width * (end - begin)), classes = values.class[0];
+  let at = LEVELS;
+  for (let i = begin, row = 0; i < end; ++i, row += width) {
+    inputs[row + level] = UNIT;
+    if (g.steps) inputs[row + LEVELS + classes[i] - LOW_CLASS] = UNIT;
+  }
+  if (g.steps) at += CLASSES;
+  for (const name of g.own)
+    for (const column of columns[name]) {
+      for (let i = begin, to = at; i < end; ++i, to += width) inputs[to] = column[i];
+      ++at;
+    }
+  if (!g.parents) return inputs;
+  const { found, weights } = parents;
   for (const column of columns[g.name]) {
-    let sum = 0;
-    for (let j = 0; j < 4; ++j) sum += weights[j] * column[found[j]];
-    inputs[at++] = sum >> 8;
+    for (let i = begin, to = at; i < end; ++i, to += width) {
+      const j = 4 * i, a = weights[j] * column[found[j]] + weights[j + 1] * column[found[j + 1]];
+      inputs[to] = (a + weights[j + 2] * column[found[j + 2]] + weights[j + 3] * column[found[j + 3]]) >> 8;
+    }
+    ++at;
+  }
+  return inputs;
+}
+
+// Reads one channel of the anchors from `begin` to `end`. kept: whether its values are inputs later.
+function readChannel(g, c, model, reader, inputs, width, begin, end, classes, live, to, column, kept) {
+  const [w, v] = model.weights[c], D = g.inputs[c], factor = model.factor[c], offset = model.offset[c];
+  const meanBias = model.meanBias[c], scaleBias = model.scaleBias[c], meanShift = model.meanShift[c], scaleShift = model.scaleShift[c];
+  for (let i = begin, row = 0; i < end; ++i, row += width) {
+    if (live && !live[i]) continue;
+    let mean = meanBias, scale = scaleBias; // below 2^31 with all inputs
+    for (let d = 0; d < D; ++d) {
+      const x = inputs[row + d];
+      mean = (mean + Math.imul(w[d], x)) | 0;
+      scale = (scale + Math.imul(v[d], x)) | 0;
+    }
+    const own = g.steps ? classes[i] : 0, fine = own + 2;
+    mean = (clamp(shifted(mean, meanShift), -LARGEST, LARGEST) + ((1 << fine) >> 1)) >> fine;
+    scale = clamp(shifted(scale, scaleShift) + 32 - 8 * own, 0, TOP);
+    const value = g.binary ? reader.bit(zeros[scale]) : reader.symbol(mean, scale);
+    to[i] = value;
+    if (!kept) continue;
+    const reach = Math.floor(2 ** 29 / factor) >> fine;
+    const scaled = clamp(value, -reach, reach) * 2 ** fine * factor - offset;
+    column[i] = clamp((scaled + 2048) >> 12, -REACH, REACH);
+    if (g.chain) inputs[row + D] = column[i];
   }
 }
 
@@ -303,29 +374,13 @@ function readGroups(groups, models, readers, N, ends, parents) {
   for (let level = 0; level < LEVELS; ++level) {
     const begin = level ? ends[level - 1] : 0, end = ends[level];
     for (const g of groups) {
-      const model = models[g.name], reader = readers[g.name], needed = g.chain || g.parents || groups.some((o) => o.own.includes(g.name));
-      const width = g.inputs[0] + (g.chain ? g.channels : 0), inputs = new Int16Array(width * (end - begin));
-      for (let i = begin; i < end; ++i) fillInputs(inputs, (i - begin) * width, g, level, i, values, columns, parents);
+      const kept = g.chain || g.parents || groups.some((o) => o.own.includes(g.name)), width = g.inputs[0] + (g.chain ? g.channels : 0);
+      const inputs = makeInputs(g, width, level, begin, end, values, columns, parents), classes = values.class[0];
       for (let c = 0; c < g.channels; ++c) {
-        const [w, v] = model.weights[c], D = g.inputs[c], factor = model.factor[c], offset = model.offset[c];
-        const used = [];
-        for (let d = 0; d < D; ++d) if (w[d] || v[d]) used.push(d);
-        for (let i = begin; i < end; ++i) {
-          if (g.masked && !values.slots[Math.floor(c / 3)][i]) continue;
-          const row = (i - begin) * width, own = g.steps ? values.class[0][i] : 0, fine = own + 2;
-          let mean = model.meanBias[c], scale = model.scaleBias[c];
-          for (const d of used) (mean += w[d] * inputs[row + d]), (scale += v[d] * inputs[row + d]);
-          mean = (clamp(shifted(mean, model.meanShift[c]), -LARGEST, LARGEST) + ((1 << fine) >> 1)) >> fine;
-          scale = clamp(shifted(scale, model.scaleShift[c]) + 32 - 8 * own, 0, TOP);
-          const value = g.binary ? reader.bit(zeros[scale]) : reader.symbol(mean, scale);
-          if (g.name === "class" && (value < LOW_CLASS || value >= LOW_CLASS + CLASSES)) fail("a step class out of range");
-          values[g.name][c][i] = value;
-          if (!needed) continue;
-          const reach = Math.floor(2 ** 29 / factor) >> fine;
-          const scaled = clamp(value, -reach, reach) * 2 ** fine * factor - offset;
-          columns[g.name][c][i] = clamp((scaled + 2048) >> 12, -REACH, REACH);
-          if (g.chain) inputs[row + D] = columns[g.name][c][i];
-        }
+        const live = g.masked ? values.slots[Math.floor(c / 3)] : null;
+        readChannel(g, c, models[g.name], readers[g.name], inputs, width, begin, end, classes, live, values[g.name][c], columns[g.name][c], kept);
+        if (g.name !== "class") continue;
+        for (let i = begin; i < end; ++i) if (classes[i] < LOW_CLASS || classes[i] >= LOW_CLASS + CLASSES) fail("a step class out of range");
       }
     }
   }
@@ -362,11 +417,7 @@ function crc32(bytes, before = 0) {
   for (let i = 0; i < bytes.length; ++i) c = crcTable[(c ^ bytes[i]) & 255] ^ (c >>> 8);
   return ~c >>> 0;
 }
-function littleEndian(numbers) {
-  const view = new DataView(new ArrayBuffer(4 * numbers.length));
-  numbers.forEach((v, i) => view.setInt32(4 * i, v, true));
-  return new Uint8Array(view.buffer);
-}
+const bytesOf = (numbers) => new Uint8Array(numbers.buffer, numbers.byteOffset, numbers.byteLength); // browsers run on little-endian machines
 async function inflate(bytes) {
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
   return new Uint8Array(await new Response(stream).arrayBuffer());
@@ -381,24 +432,21 @@ export async function readCompact(bytes) {
   if (header.version !== 2) fail(`version ${header.version}`);
   const parts = {};
   for (const [name, length] of header.parts) parts[name] = bytes.subarray(at, (at += length));
-  const places = readPlaces(header, new Reader(parts.positions));
 
   // the order: level by level, along the curve within a level
-  const along = places.map((p) => p.fine), level = along.map(() => 2);
-  for (const number of [1, 0]) along.forEach((p, i) => (i === 0 || !sameBox(p, along[i - 1], header.boxes[number])) && (level[i] = number));
-  const rows = [], ends = [];
-  for (let l = 0; l < LEVELS; ++l) {
-    level.forEach((own, i) => own === l && rows.push(i));
-    ends.push(rows.length);
+  const { own, lattice, fine } = readPlaces(header, new Reader(parts.positions)), N = header.N;
+  const level = new Uint8Array(N).fill(2), order = new Int32Array(N), curve = new Int32Array(N), ends = [];
+  for (const number of [1, 0]) for (let i = 0; i < N; ++i) if (!i || !sameBox(fine, i, i - 1, header.boxes[number])) level[i] = number;
+  for (let l = 0, at = 0; l < LEVELS; ++l) {
+    for (let i = 0; i < N; ++i) if (level[i] === l) (order[at] = i), (curve[i] = at++);
+    ends.push(at);
   }
-  const curve = new Int32Array(rows.length);
-  rows.forEach((row, place) => (curve[row] = place));
 
   const groups = makeGroups(header), stream = new Reader(parts.models), models = {}, readers = {};
   for (const g of groups) models[g.name] = readModel(stream, g);
   stream.finish();
   for (const g of groups) readers[g.name] = new Reader(parts[g.name]);
-  const values = readGroups(groups, models, readers, rows.length, ends, findParents(along, curve, level));
+  const values = readGroups(groups, models, readers, N, ends, findParents(fine, curve, level));
 
   const networks = {}, exact = {}, weights = new Reader(parts.networks);
   const floats = await inflate(parts.exact), numbers = new DataView(floats.buffer);
@@ -411,12 +459,12 @@ export async function readCompact(bytes) {
   });
   weights.finish();
 
-  let checksum = crc32(littleEndian(rows.flatMap((row) => along[row])));
-  for (const g of groups) for (const channel of values[g.name]) checksum = crc32(littleEndian(channel), checksum);
+  let checksum = crc32(bytesOf(pick(fine, order, Int32Array)));
+  for (const g of groups) for (const channel of values[g.name]) checksum = crc32(bytesOf(channel), checksum);
   for (const { values: whole, exponents } of Object.values(networks))
-    checksum = crc32(littleEndian(exponents), crc32(littleEndian(whole), checksum));
+    checksum = crc32(bytesOf(exponents), crc32(bytesOf(whole), checksum));
   checksum = crc32(floats, checksum);
   if (checksum !== header.integers) fail("numbers with another checksum");
-  const cells = rows.map((row) => places[row].own), lattice = rows.map((row) => places[row].lattice);
-  return { header, cells, lattice, groups: values, networks, exact, checksum };
+  const cells = pick(own, order, Float64Array);
+  return { header, cells, lattice: Uint8Array.from(order, (i) => lattice[i]), groups: values, networks, exact, checksum };
 }

@@ -30,7 +30,7 @@ from scene_experts.evaluate import results
 from scene_experts.evaluate.lpips import tensor_shapes
 from scene_experts.evaluate.weights import _hash_tensors, _read_cache
 from scene_experts.files import registry, result_folder
-from scene_experts.files.anchors import compact, torchscript
+from scene_experts.files.anchors import compact, live, torchscript
 from scene_experts.files.anchors.read import read_folder
 from scene_experts.files.anchors.write import contents, describe
 from scene_experts.files.archive.torch_archive import read_tensors
@@ -195,9 +195,16 @@ def _zip(folder: Path) -> None:
 
 
 def _compact(folder: Path) -> None:
+    compact.write(folder / "scene.compact", _anchors(), {})
+
+
+def _live(folder: Path) -> None:
+    live.write(folder / "scene.live.html", _anchors(), {})
+
+
+def _anchors() -> Any:
     run = run_in_memory("moe-gs")
-    about = describe(run, _world()) | {"train": _to_json(run.config.train)}
-    compact.write(folder / "scene.compact", contents(run, _world(), about), {})
+    return contents(run, _world(), describe(run, _world()) | {"train": _to_json(run.config.train)})
 
 
 def _world() -> Any:
@@ -413,6 +420,7 @@ TARGETS: dict[str, Target] = {
     "ksplat-0": Target(_foreign("scene.ksplat", lambda s: foreign.ksplat(s, 0)), _read_only_file),
     "zip": Target(_zip, _read_only_file, packs={".zip": containers.zipped}),
     "compact": Target(_compact, _scene_of_compact, packs={".compact": containers.compact}),
+    "live": Target(_live, _read_only_file),
     "networks": Target(_networks, lambda folder: read_tensors(folder / "net.pt"), packs={".pt": containers.zipped}),
     "torchscript": Target(_traces, lambda folder: read_tensors(folder / "net.pt"), packs={".pt": containers.zipped}),
     "result-folder": Target(_result, _read_result, packs={".pt": containers.zipped}),

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import check_writable, write_bytes, write_json
-from scene_experts.data.views import World
+from scene_experts.data.views import Capture, World
 from scene_experts.files.measure import Tell, capture_if_there, cost
 from scene_experts.files.options import DEFAULT, MAX_DEGREE, Options
-from scene_experts.files.placed import AROUND
-from scene_experts.files.registry import GAUSSIANS, Family, Format, family_named, format_named, format_names, formats_of
+from scene_experts.files.placed import AROUND, place_cameras
+from scene_experts.files.registry import GAUSSIANS, Family, Format, Note, family_named, format_named, format_names, formats_of
 from scene_experts.files.scene_folder import origin_note, origin_of, tell_origin, trained_in, width_in, world_of, write_scene_folder
 from scene_experts.files.standard import NOTE_FORMAT, ExportTask, Made, Written, export_gaussians
 from scene_experts.render import Rasterizer
@@ -187,7 +187,7 @@ def _expect_unused(options: Options, format: str) -> None:
     """Raises InputError for options of standard files with a format that is none, and for those of
     formats with a precision with another one."""
     for f in fields(options):
-        if f.name == "measure" or getattr(options, f.name) == f.default:
+        if f.name == "measure" or getattr(options, f.name) == f.default or (f.name == "title" and format_named(format).view_note):
             continue
         if f.name in FITTED:
             if format_named(format).fit is None:
@@ -217,11 +217,13 @@ def _export_scene(work: ExportTask, out: Path | None) -> Written:
     path = place_of(run, work.name, format, out)
     origin = origin_of(run, trained)
     about, world = family.describe(run, trained) | trained_in(run) | origin_note(origin), trained.seen_from(origin)
-    contents, fitted = family.contents(run, world, about), []
-    if format.fit is not None:
+    contents, fitted, note = family.contents(run, world, about), [], {}
+    if format.fit is not None or format.view_note is not None:
         with capture_if_there(run, needed=False) as capture:
-            contents, fitted = format.fit(run, contents, trained, work.options, capture, work.rasterize, work.tell)
-    detail = format.write(path, contents, {})  # type: ignore[misc]
+            if format.fit is not None:
+                contents, fitted = format.fit(run, contents, trained, work.options, capture, work.rasterize, work.tell)
+            note = _view_note(work, capture, world)
+    detail = format.write(path, contents, note)  # type: ignore[misc]
     rows, size = len(run.scene.positions), path.stat().st_size
     said = f"{rows:,} {traits.rows}, {size / 1e6:.2f} MB with networks" + (f", {detail}" if detail is not None else "")
     written = Written(path, size, rows, (f"wrote {path}", said, *fitted))
@@ -249,6 +251,18 @@ def _export_drawn(work: ExportTask, out: Path | None) -> Written:
     size, said = path.stat().st_size, str(contents)
     write_json(path.with_name(path.name + ".json"), {"format": NOTE_FORMAT, "recipe": run.config.train.recipe, "step": run.step, **note})
     return Written(path, size, len(contents), (f"wrote {path}", f"{said}, {size / 1e6:.2f} MB, in the capture's own frame"))
+
+
+def _view_note(work: ExportTask, capture: Capture | None, world: World) -> Note:
+    """The entries of a note about the views of a run's scene, and its title."""
+    if work.format.view_note is None:
+        return {}
+    run = work.run
+    views = capture or place_cameras(run.path, run.scene.positions.detach().cpu().double(), world, background=run.config.data.background)
+    note = work.format.view_note(views, world)
+    if views.kind == AROUND:
+        note.pop("cameras", None)  # nothing was photographed from there
+    return note | ({} if work.options.title is None else {"title": work.options.title})
 
 
 def _export_folder(work: ExportTask, family: Family, world: World, out: Path) -> Written:

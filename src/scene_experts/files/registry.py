@@ -46,6 +46,7 @@ FORMATS = {
     "usd": "scene_experts.files.formats.usd",
     "mesh": "scene_experts.files.mesh",
     "html": "scene_experts.files.formats.html",
+    "live": "scene_experts.files.anchors.live",
 }
 """Name on the command line -> module that states the format as `FORMAT`."""
 

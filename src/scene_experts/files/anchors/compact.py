@@ -154,11 +154,13 @@ def read(path: Path) -> AnchorData:
         head = source.head(4096)
         if not head.startswith(container.MARK) and head[8:9] == b"{" and b"compact scene" in head:
             raise InputError(f"expected a compact file of version {VERSION} at {path}, found version 1; export its run again")
-        return _decode(source)
+        return decode(source.read(), source)
 
 
-def _decode(source: Source) -> AnchorData:
-    header, parts = container.part(source.read())
+def decode(data: bytes, source: Source) -> AnchorData:
+    """The scene in the bytes of a file, which were read from `source`. Raises CutShort and Damaged
+    for damaged ones."""
+    header, parts = container.part(data)
     if header["version"] != VERSION:
         raise Damaged(f"version {header['version']!r} of the format, not {VERSION}")
     n = whole_number(header["N"], "the number of anchors", 0, MOST_ANCHORS)

@@ -88,11 +88,17 @@ def _whole(value: NDArray[np.float64], what: str) -> Ints:
     return found.astype(np.int32)
 
 
+def distance_exponent(data: AnchorData) -> int:
+    """The whole exponent of two by which a column that sees the distance is larger in files than in
+    the training."""
+    scale = float(((data.about or {}).get("world") or {}).get("scale", 1.0))
+    return round(math.log2(scale)) if 1e-15 <= scale <= 1e15 else 0
+
+
 def _columns(data: AnchorData) -> dict[str, tuple[int, int]]:
     """By tensor of a network: the column that sees the distance, and the whole exponent of two by
     which the unit of files makes it larger than that of the training."""
-    scale = float(((data.about or {}).get("world") or {}).get("scale", 1.0))
-    exponent = round(math.log2(scale)) if 1e-15 <= scale <= 1e15 else 0
+    exponent = distance_exponent(data)
     codes = data.networks["appearance.table"].shape[1] if "appearance.table" in data.networks else 0
     out = {f"{a}.experts.w1": (-1 - (codes if a == "color" else 0), exponent) for a in data.add_dist}
     return out | ({"feature_bank.experts.w1": (3, exponent)} if "feature_bank.experts.w1" in data.networks else {})

@@ -59,31 +59,32 @@ def write(path: Path, splats: Splats, note: dict[str, Any]) -> str | None:
     centre = splats.means.double().median(0).values if len(splats) else torch.zeros(3, dtype=torch.float64)
     splats = replace(splats, means=(splats.means.double() - centre).float())
     settings, scene = page_settings(splats, note, centre), scaled(splats, unit_of(splats))
-    code = (ASSETS / "viewer.min.js.gz").read_bytes()
-    page = Template((ASSETS / "page.html").read_text()).substitute(
-        title=markup.escape(str(note.get("title", "scene-experts"))),
-        licences=(ASSETS / "LICENCES.txt").read_text().replace("--", "- -"),
-        count=f"{len(splats):,}",
-        settings=json.dumps(settings, allow_nan=False).replace("</", "<\\/"),
-        scene=base64.b64encode(spz_bytes(scene)).decode(),
-        code=base64.b64encode(code).decode(),
-    )
-    write_bytes(path, page.encode())
+    licences = (ASSETS / "LICENCES.txt").read_text()
+    write_bytes(path, make_page("scene-experts", note, settings, spz_bytes(scene), "viewer.min.js.gz", licences))
     clipped = float(out_of_range(scene).float().mean()) if len(scene) else 0.0
     return size_warning(scene) if clipped > _HARMLESS else None
+
+
+def make_page(generator: str, note: Mapping[str, Any], settings: Mapping[str, Any], scene: bytes, code: str, licences: str) -> bytes:
+    """The bytes of a page. generator: by which readers know it; scene: a file; code: the name of the
+    compressed script among the assets; licences: of what is in the script."""
+    page = Template((ASSETS / "page.html").read_text()).substitute(
+        generator=generator,
+        title=markup.escape(str(note.get("title", "scene-experts"))),
+        licences=licences.replace("--", "- -"),
+        count=f"{settings['count']:,}",
+        settings=json.dumps(settings, allow_nan=False).replace("</", "<\\/"),
+        scene=base64.b64encode(scene).decode(),
+        code=base64.b64encode((ASSETS / code).read_bytes()).decode(),
+    )
+    return page.encode()
 
 
 def read(path: Path) -> Splats:
     """The Gaussians in a page that `write` made. Raises InputError for other and damaged pages."""
     with opening(path, budget.HTML) as source:
         page = source.read()
-        content = _script(page, _SCENE)
-        if content is None:
-            raise CutShort("no scene")
-        try:
-            scene = base64.b64decode(content, validate=True)
-        except ValueError:
-            raise Damaged("a scene that is not base64") from None
+        scene = scene_in(page)
         settings = _settings(page)
         unit, centre = settings.get("unit", 1.0), settings.get("centre", [0.0, 0.0, 0.0])  # older pages have none
         number(unit, "the unit of lengths", 2.0**-_MOST, 2.0**_MOST)
@@ -92,6 +93,17 @@ def read(path: Path) -> Splats:
         place = torch.tensor([number(value, "the centre", -LARGEST, LARGEST) for value in centre], dtype=torch.float64)
         found = scaled(decode(scene, source), 1 / unit)
         return replace(found, means=(found.means.double() + place).float()).checked(path)
+
+
+def scene_in(page: bytes) -> bytes:
+    """The file in a page. Raises CutShort and Damaged for a page without one."""
+    content = _script(page, _SCENE)
+    if content is None:
+        raise CutShort("no scene")
+    try:
+        return base64.b64decode(content, validate=True)
+    except ValueError:
+        raise Damaged("a scene that is not base64") from None
 
 
 def unit_of(splats: Splats) -> float:
@@ -148,23 +160,36 @@ def view_note(capture: Capture, world: World) -> dict[str, Any]:
 
 
 def page_settings(splats: Splats, note: Mapping[str, Any], centre: Tensor | None = None) -> dict[str, Any]:
-    """The settings of the page's script: poses, up direction, distances, background.
+    """The settings of the page's script: those of `view_settings`, the unit of lengths and the way
+    to draw.
 
-    The camera stays within `reach` of the poses; None does not limit it. splats: Relative to
-    `centre` [3], a place in the frame of the note; None: its origin.
+    splats: Relative to `centre` [3], a place in the frame of the note; None: its origin.
     """
     centre = torch.zeros(3, dtype=torch.float64) if centre is None else centre
-    means = splats.means.double().numpy()
+    return {
+        "count": len(splats),
+        "unit": unit_of(splats),
+        "centre": centre.tolist(),
+        **view_settings(splats.means, note, centre),
+        "background": [float(v) for v in note.get("background", (0.0, 0.0, 0.0))],
+        "antialias": bool(note.get("antialias", False)),
+    }
+
+
+def view_settings(places: Tensor, note: Mapping[str, Any], centre: Tensor) -> dict[str, Any]:
+    """Poses, up direction and distances. The camera stays within `reach` of the poses; None does
+    not limit it.
+
+    places: [N, 3] where the scene is, relative to `centre` [3], a place in the frame of the note.
+    """
+    means = places.double().numpy()
     poses = [_pose(entry, centre) for entry in note.get("cameras") or []]
     first = _pose(note["camera"], centre) if note.get("camera") else poses[0] if poses else _from_outside(means)
     poses = poses or [first]
     up = estimate_up(torch.tensor([pose["rotation"] for pose in poses], dtype=torch.float64))
     distance = _distance(means, first)
-    places = torch.tensor([pose["position"] for pose in poses], dtype=torch.float64)
+    positions = torch.tensor([pose["position"] for pose in poses], dtype=torch.float64)
     return {
-        "count": len(splats),
-        "unit": unit_of(splats),
-        "centre": centre.tolist(),
         "pose": first,
         "poses": poses,
         "flight": [_pose(entry, centre) for entry in note.get("flight") or []],
@@ -172,12 +197,10 @@ def page_settings(splats: Splats, note: Mapping[str, Any], centre: Tensor | None
         "fov": first["fov"],
         "up": up.tolist(),
         "distance": distance,
-        "reach": find_region(places, distance).radius if note.get("cameras") else None,
+        "reach": find_region(positions, distance).radius if note.get("cameras") else None,
         "near": distance / 500,
         "far": max(distance * 1000, 4 * _radius(means)),
         "speed": distance / 2,
-        "background": [float(v) for v in note.get("background", (0.0, 0.0, 0.0))],
-        "antialias": bool(note.get("antialias", False)),
     }
 
 

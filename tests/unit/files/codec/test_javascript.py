@@ -20,7 +20,7 @@ const out = [];
 for (const path of process.argv.slice(2)) {{
   try {{
     const scene = await readCompact(new Uint8Array(readFileSync(path)));
-    out.push([scene.checksum, scene.cells[0], scene.groups.feature.map((c) => c[0])]);
+    out.push([scene.checksum, [...scene.cells.slice(0, 3)], scene.groups.feature.map((c) => c[0])]);
   }} catch (error) {{
     out.push(String(error.message));
   }}

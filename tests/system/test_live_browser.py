@@ -1,0 +1,233 @@
+"""The live page in headless Chromium, with WebGPU in software and with WebGL 2 alone: its decode is Python's, its pictures are our
+rasteriser's, and it asks for nothing. Pictures are read from the page's own texture: the canvas of a software device shows none."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from scene_experts.core.types import Mode
+from scene_experts.files.anchors import live
+from scene_experts.render import choose
+from support.live_page import CHROMIUM, GL, GPU, browsers
+from support.live_scenes import CASES, STEP, compare, contents_of, decoded, look, make_run, scene_in_page
+
+pytest.importorskip("playwright.sync_api")
+pytestmark = [pytest.mark.slow, pytest.mark.foreign, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")]
+WIDTH, HEIGHT = 320, 240
+PLACES = ((0.3, -0.4, -1.0), (2.5, 0.5, 0.0), (-3.0, 1.0, 2.0), (0.5, -2.0, 9.0))
+SEEN = [look(place, width=WIDTH, height=HEIGHT) for place in PLACES]
+BACKGROUND = (0.2, 0.3, 0.5)
+ROUTED = (
+    "scaffold-gs",
+    "moe-gs",
+    "moe-gs-posrouter",
+    "moe-gs-balance",
+    "margin",
+)  # differ in the worker alone, see unit/files/anchors/test_live.py
+
+
+def write(path, case, **note):
+    """A page of a case with the four places as its photographs'. Returns the run and the page's settings."""
+    run = make_run(case)
+    entries = [seen.pose for seen in SEEN]
+    live.write(path, contents_of(run), {"cameras": entries, "nearest": 0.01 / 2.5, "background": BACKGROUND, **note})
+    return run, json.loads(re.search(rb'id="settings">(.*?)</script>', path.read_bytes(), re.DOTALL)[1])
+
+
+def go(page, pose):
+    page.tab.evaluate("pose => sceneExperts.setPose(pose)", pose)
+    page.settle()
+
+
+def ours(scene, camera):
+    """Our picture of a scene from a camera of the trained world, [H, W, 3]."""
+    with torch.no_grad():
+        rows = scene.select(scene.table, camera, STEP, Mode.DRAW)
+        rows = torch.arange(len(scene.table)) if rows is None else rows
+        made = scene.finish(scene.decode_composed(rows, camera, STEP), camera, STEP, Mode.DRAW)
+        return choose("auto", "cpu")(made.gaussians, camera, torch.tensor(BACKGROUND)).image.clamp(0, 1).numpy()
+
+
+def psnr(a, b):
+    return -10 * np.log10(((a - b) ** 2).mean() + 1e-12)
+
+
+@pytest.mark.parametrize("flags", [GL, GPU], ids=["WebGL 2", "WebGPU"])
+def test_pictures_are_those_of_our_rasteriser(tmp_path, flags):
+    """As packed: with halves on WebGPU. Every kind of routing, levels, masks and codes; four places."""
+    with browsers(flags, WIDTH, HEIGHT) as make:
+        for case in ("moe-gs", "octree-gs"):
+            run, settings = write(tmp_path / f"{case}.html", case)
+            scene = scene_in_page(run, tmp_path / f"{case}.html")
+            page = make().open(tmp_path / f"{case}.html")
+            assert page.said == "" and page.renderer == ("WebGPU" if flags is GPU else "WebGL 2")
+            for seen, pose in zip(SEEN, settings["poses"]):
+                go(page, pose)
+                found, wanted = page.picture(BACKGROUND), ours(scene, seen.camera)
+                assert wanted.std() > 0.05 and psnr(found, wanted) > 45, (case, psnr(found, wanted))
+            assert page.errors == [] and all(request.startswith(("file:", "blob:")) for request in page.requests)
+            page.tab.close()
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if case not in ROUTED])
+def test_webgpu_decodes_as_python_does(tmp_path, case):
+    """With values of 32 bits: every kind of routing and network, levels, codes, masks and the smoothing filter."""
+    path = tmp_path / "a.html"
+    run, settings = write(path, case)
+    path.write_bytes(path.read_bytes().replace(b'"exact": false', b'"exact": true'))
+    with browsers(GPU, 64, 48) as make:
+        page = make().open(path)
+        assert page.renderer == "WebGPU", page.tab.evaluate("sceneExperts.page.renderer.why")
+        go(page, settings["poses"][1])
+        found, wanted = page.decoded(), decoded(scene_in_page(run, path), SEEN[1].camera, settings["centre"])
+        found = found[: len(wanted)].copy()
+        found[:, 4:7] *= page.tab.evaluate("sceneExperts.page.renderer.renderer.scene.unit")
+        away, differ = compare(found, wanted)
+        assert (wanted[:, 3] > 0).mean() > 0.05 and away < 1e-5 and differ == 0, (away, differ)
+        assert page.errors == [] and page.tab.evaluate("sceneExperts.page.renderer.renderer.gpu.errors") == []
+
+
+SORT = """async (sizes) => {
+  const { gpu, sorter } = sceneExperts.page.renderer.renderer, out = [];
+  for (const n of sizes) {
+    const count = gpu.buffer(4, new Uint32Array([n])), blocks = new Uint32Array([Math.max(1, Math.ceil(n / 1024)), 1, 1, 0]);
+    const args = gpu.buffer(16, blocks, GPUBufferUsage.STORAGE | GPUBufferUsage.INDIRECT);
+    const made = new sorter.constructor(gpu, Math.max(n, 1), count, args), keys = new Uint32Array(n);
+    for (let i = 0, state = 12345; i < n; ++i) {
+      state = (Math.imul(state, 1664525) + 1013904223) >>> 0;
+      keys[i] = (state >>> 8) & (i % 3 ? 0xffffff : 0xff);
+    }
+    gpu.device.queue.writeBuffer(made.keys, 0, keys);
+    gpu.device.queue.writeBuffer(made.ids, 0, Uint32Array.from(keys, (_, i) => i));
+    const encoder = gpu.device.createCommandEncoder(), pass = encoder.beginComputePass();
+    made.record(pass);
+    pass.end();
+    gpu.device.queue.submit([encoder.finish()]);
+    const found = new Uint32Array(await gpu.read(made.ids)).subarray(0, n);
+    const wanted = [...keys.keys()].sort((i, j) => keys[i] - keys[j] || i - j);
+    out.push(wanted.reduce((wrong, v, i) => wrong + (v !== found[i]), 0));
+  }
+  return out;
+}"""
+
+
+def test_the_sort_is_stable_at_the_edges_of_its_blocks_and_frames_are_cheap(tmp_path):
+    """A turn of the camera decodes nothing; a frame has at most 24 dispatches and 2 draws; a Gaussian takes about 100 bytes."""
+    _, settings = write(tmp_path / "a.html", "scene-experts")
+    with browsers(GPU, 64, 48) as make:
+        page = make().open(tmp_path / "a.html")
+        memory = page.tab.evaluate("[sceneExperts.page.renderer.renderer.gpu.bytes, sceneExperts.page.renderer.renderer.slots]")
+        networks = page.tab.evaluate("sceneExperts.page.renderer.renderer.scene.heads.reduce((n, head) => n + head.networks.byteLength, 0)")
+        assert (memory[0] - networks) / memory[1] < 105  # of few anchors, whose groups are mostly empty
+        assert page.tab.evaluate(SORT, [0, 1, 1023, 1024, 1025, 100_000]) == [0] * 6
+        go(page, settings["poses"][0])
+        counts = "[counted.dispatches, counted.draws, sceneExperts.page.renderer.renderer.decodes, sceneExperts.page.frames]"
+        before = page.tab.evaluate(counts)
+        go(page, settings["poses"][2])
+        moved = page.tab.evaluate(counts)
+        frames = moved[3] - before[3]
+        assert moved[2] == before[2] + 1 and moved[0] - before[0] <= 24 * frames and moved[1] - before[1] <= 2 * frames
+        turned = {**settings["poses"][2], "rotation": settings["poses"][1]["rotation"]}
+        go(page, turned)
+        assert page.tab.evaluate(counts)[2] == moved[2]
+
+
+WRONG = """
+const real = GPUDevice.prototype.createShaderModule;
+GPUDevice.prototype.createShaderModule = function (given) {
+  return real.call(this, { code: given.code.replaceAll(%s) });
+};
+"""
+SMALL = """
+const real = GPU.prototype.requestAdapter;
+GPU.prototype.requestAdapter = async function () {
+  return { limits: { maxBufferSize: 4096, maxStorageBufferBindingSize: 4096 }, requestDevice: () => { throw new Error("not asked for"); } };
+};
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (WRONG % '"tanh(", "0.9 * tanh("', "decodes other opacities"),
+        (WRONG % '"(keys[i] >> shift)", "(keys[i] >> (shift / 2u))"', "does not sort"),
+        (SMALL, "The scene needs 1 MB in one piece"),
+    ],
+    ids=["wrong numbers", "wrong order", "little memory"],
+)
+def test_a_device_that_is_wrong_or_small_is_left_aside(tmp_path, change, why):
+    _, settings = write(tmp_path / "a.html", "scaffold-gs")
+    with browsers(GPU, WIDTH, HEIGHT) as make:
+        page = make(change).open(tmp_path / "a.html")
+        assert page.renderer == "WebGL 2" and why in page.tab.evaluate("sceneExperts.page.renderer.why") and page.said == ""
+        go(page, settings["poses"][0])
+        assert page.picture(BACKGROUND).std() > 0.05
+
+
+def test_a_device_that_goes_away_is_replaced(tmp_path):
+    """WebGL 2 goes on where WebGPU ended."""
+    _, settings = write(tmp_path / "a.html", "scaffold-gs")
+    with browsers(GPU, WIDTH, HEIGHT) as make:
+        page = make().open(tmp_path / "a.html")
+        go(page, settings["poses"][0])
+        before = page.picture(BACKGROUND)
+        page.tab.evaluate("sceneExperts.page.lose()")
+        page.tab.wait_for_function("sceneExperts.page.renderer?.name === 'WebGL 2'")
+        go(page, settings["poses"][0])
+        assert psnr(page.picture(BACKGROUND), before) > 40 and page.said == ""
+
+
+def test_the_page_moves_by_hands_keys_links_and_its_list(tmp_path):
+    _, settings = write(tmp_path / "a.html", "scaffold-gs")
+    with browsers(GL, WIDTH, HEIGHT) as make:
+        page = make().open(tmp_path / "a.html")
+        tab, place = page.tab, lambda: np.array(page.tab.evaluate("sceneExperts.pose().position"))
+        turn = lambda: np.array(tab.evaluate("sceneExperts.pose().rotation"))  # noqa: E731
+        page.settle()
+        first, rotation = place(), turn()
+        np.testing.assert_allclose(first, settings["pose"]["position"], atol=1e-6)
+        tab.mouse.move(160, 100)
+        tab.mouse.down()
+        tab.mouse.move(190, 100)
+        tab.mouse.up()
+        page.settle()
+        target = lambda p, r: p + settings["distance"] * r[:, 2]  # noqa: E731
+        np.testing.assert_allclose(target(place(), turn()), target(first, rotation), atol=1e-6)  # it turned around what it looks at
+        assert np.abs(turn() - rotation).max() > 0.01 and np.abs(turn() @ turn().T - np.eye(3)).max() < 1e-9
+        before = place()
+        tab.mouse.wheel(0, -300)
+        page.settle()
+        assert np.linalg.norm(place() - before) > 0.01
+        tab.keyboard.press("r")
+        tab.wait_for_timeout(1500)
+        page.settle()
+        np.testing.assert_allclose(place(), first, atol=1e-6)
+        tab.click("#places")
+        tab.click("#list button:nth-child(3)")
+        tab.wait_for_timeout(1500)
+        page.settle()
+        np.testing.assert_allclose(place(), settings["poses"][2]["position"], atol=1e-6)
+        tab.keyboard.press("l")
+        assert "position=" in tab.evaluate("location.hash")
+        link = ",".join(map(str, first))
+        tab.evaluate(f"location.hash = 'position={link}&rotation={','.join(map(str, rotation.ravel()))}&fov=50'")
+        tab.wait_for_timeout(300)
+        np.testing.assert_allclose(place(), first, atol=1e-6)
+        tab.keyboard.press("h")
+        assert tab.is_visible("#help") and not tab.is_visible("#list")
+        tab.keyboard.press("Escape")
+        assert not tab.is_visible("#help") and page.errors == []
+
+
+def test_a_damaged_file_is_one_sentence_on_the_page(tmp_path):
+    write(tmp_path / "a.html", "scaffold-gs")
+    page = (tmp_path / "a.html").read_text()
+    start, scene, rest = re.split(r'(?<=id="scene">)([^<]*)', page, maxsplit=1)
+    with browsers(GL, WIDTH, HEIGHT) as make:
+        for i, broken in enumerate((scene[: 4 * (len(scene) // 8)], "", "?" + scene[1:])):
+            (tmp_path / f"{i}.html").write_text(start + broken + rest)
+            said = make().open(tmp_path / f"{i}.html").said
+            assert said.startswith("The scene could not be shown: expected a compact file") and said.count(".") <= 1, said

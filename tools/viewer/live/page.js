@@ -1,0 +1,317 @@
+// The page: one scene from data inside it alone, decoded and drawn here, and the hands that move through it.
+import { Camera, add, between, length, viewOf } from "./camera.js";
+import { openRenderer } from "./renderers.js";
+
+const FLIGHT = 16; // seconds of a round
+const JUMP = 0.9; // seconds from one place to another
+const REST = 250; // milliseconds without news until the picture is final
+const SLOW = 40, QUICK = 18, LEAST = 0.35; // milliseconds of a frame that lower and raise the resolution; its smallest share
+const WIDEST = 100; // degrees
+const LARGEST = 4096; // pixels of a side of the picture
+
+const find = (id) => document.getElementById(id);
+export const say = (text) => ((find("note").textContent = text), (find("note").hidden = !text));
+const isCalm = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
+
+export class Page {
+  // ask: of a worker, see worker.js.
+  constructor(settings, ask) {
+    Object.assign(this, { settings, ask, keys: new Set(), hands: new Map(), flight: null, jump: null, held: true, scale: 1, frames: 0, index: settings.index });
+    this.camera = new Camera(settings.up, settings.distance);
+    this.camera.still = isCalm();
+    this.veil = find("veil");
+    this.veil.style.setProperty("--back", `rgb(${settings.background.map((v) => Math.round(255 * v))})`);
+    this.listen();
+    this.setPose(settings.pose);
+    this.readHash();
+  }
+
+  async load(text) {
+    await this.ask("open", { text, settings: this.settings });
+    await this.open(true);
+    say("");
+  }
+
+  // The graphics device went away: WebGL 2 goes on.
+  lose() {
+    say("The graphics device went away; drawing another way");
+    this.renderer = null;
+    this.open(false).then(() => say(""), (error) => say(`The scene could not be shown: ${error.message}`));
+  }
+
+  // Opens the best renderer, without `gpu` that of WebGL 2.
+  async open(gpu) {
+    const makeCanvas = () => {
+      document.querySelector("canvas")?.remove();
+      const canvas = document.createElement("canvas");
+      canvas.setAttribute("role", "img");
+      canvas.setAttribute("aria-label", `the scene, ${this.settings.count.toLocaleString("en")} Gaussians`);
+      canvas.addEventListener("webglcontextlost", () => say("The browser took the graphics away; load the page again"));
+      document.querySelector("main").prepend(canvas);
+      this.canvas = canvas;
+      this.resize();
+      return canvas;
+    };
+    const lost = () => this.lose();
+    this.renderer = await openRenderer(this.ask, this.settings, makeCanvas, () => this.view(), { lost, news: (error) => (error ? say(error.message) : this.wake()), gpu });
+    this.wake();
+  }
+
+  listen() {
+    const main = document.querySelector("main"), on = (target, names, act, options) => names.split(" ").forEach((name) => target.addEventListener(name, act, options));
+    on(main, "pointerdown pointermove pointerup pointercancel", (event) => this.point(event));
+    on(main, "wheel", (event) => this.wheel(event), { passive: false });
+    on(main, "contextmenu", (event) => event.target === this.canvas && event.preventDefault());
+    on(window, "resize", () => this.resize());
+    on(window, "hashchange", () => this.readHash());
+    on(window, "keydown", (event) => this.press(event));
+    on(window, "keyup", (event) => this.keys.delete(event.code));
+    on(window, "blur", () => this.keys.clear());
+    this.near = find("near"); // whether the camera stays where photographs were taken
+    on(this.near, "change", () => this.take());
+    if (!this.settings.reach) this.near.parentElement.hidden = !(this.near.checked = false);
+    const acts = { home: () => this.home(), previous: () => this.step(-1), next: () => this.step(1), whole: () => this.whole(),
+      ask: () => this.show("ask", "help"), close: () => this.show("ask", "help"), flight: () => this.flyAround() };
+    for (const [name, act] of Object.entries(acts)) on(find(name), "click", act);
+    find("flight").hidden = this.settings.flight.length < 2;
+    if (this.settings.poses.length < 2) return void (find("previous").hidden = find("next").hidden = true);
+    this.listPlaces();
+  }
+
+  // A button and a list: the places of the photographs; a click flies to one.
+  listPlaces() {
+    const make = (name, properties) => Object.assign(document.createElement(name), properties);
+    const button = make("button", { id: "places", textContent: "photographs", title: "places of the photographs" });
+    const list = make("section", { id: "list", hidden: true, tabIndex: 0 });
+    list.setAttribute("aria-label", "places of the photographs");
+    button.setAttribute("aria-expanded", "false");
+    button.setAttribute("aria-controls", "list");
+    list.style.cssText = "position:fixed;left:10px;max-width:min(25rem,calc(100vw - 20px));max-height:40vh;overflow:auto;background:#1c1c1cf2;border-radius:8px;padding:8px";
+    this.settings.poses.forEach((pose, i) => {
+      const place = make("button", { textContent: String(i + 1), title: `fly to photograph ${i + 1}` });
+      place.setAttribute("aria-label", `fly to photograph ${i + 1}`);
+      place.style.margin = "2px";
+      place.addEventListener("click", () => ((this.index = i), this.flyTo(pose)));
+      list.append(place);
+    });
+    button.addEventListener("click", () => this.show("places", "list"));
+    find("next").after(button);
+    find("bar").style.flexWrap = "wrap";
+    find("bar").after(list);
+  }
+
+  // Opens or closes what a button controls; without `open`, the other one of the two.
+  show(button, panel, open) {
+    const isOpen = open ?? find(panel)?.hidden, above = `${find("bar").offsetHeight + 20}px`;
+    for (const [by, what] of [["ask", "help"], ["places", "list"]]) {
+      if (!find(what)) continue;
+      find(what).hidden = !(isOpen && what === panel);
+      find(what).style.bottom = above;
+      find(by).setAttribute("aria-expanded", String(!find(what).hidden));
+      if (what === "list") find(what).style.display = find(what).hidden ? "none" : "block";
+    }
+  }
+
+  // Somebody takes the camera.
+  take() {
+    this.held = false;
+    this.flight = this.jump = null;
+    this.wake();
+  }
+
+  // One pointer turns, with the right button or two of them it moves; two fingers also come nearer.
+  point(event) {
+    const { hands } = this, { pointerId: id, clientX: x, clientY: y } = event;
+    if (event.type === "pointerdown") {
+      if (event.target !== this.canvas) return;
+      this.canvas.setPointerCapture(id);
+      hands.set(id, { x, y, moves: event.button === 2 || event.button === 1 || event.shiftKey });
+      return this.take();
+    }
+    const hand = hands.get(id);
+    if (!hand) return;
+    if (event.type !== "pointermove") return void hands.delete(id);
+    const other = [...hands.entries()].find(([number]) => number !== id)?.[1], by = [(x - hand.x) / innerHeight, (y - hand.y) / innerHeight], wide = 2 * Math.tan((this.shown * Math.PI) / 360);
+    if (other) {
+      const before = Math.hypot(hand.x - other.x, hand.y - other.y), after = Math.hypot(x - other.x, y - other.y);
+      this.camera.ask("nearer", Math.log(Math.max(after, 1) / Math.max(before, 1)));
+      this.camera.ask("pan", by.map((v) => -0.5 * wide * v));
+    } else if (hand.moves) this.camera.ask("pan", by.map((v) => -wide * v));
+    else this.camera.ask("spin", [-Math.PI * by[0], -Math.PI * by[1]]);
+    Object.assign(hand, { x, y });
+    this.take();
+  }
+
+  wheel(event) {
+    if (event.target !== this.canvas) return;
+    event.preventDefault();
+    const by = event.deltaY * (event.deltaMode === 1 ? 30 : event.deltaMode === 2 ? 300 : 1), tan = Math.tan((this.shown * Math.PI) / 360);
+    const ray = [((2 * event.clientX - innerWidth) / innerHeight) * tan, ((2 * event.clientY) / innerHeight - 1) * tan, 1];
+    this.camera.ask("nearer", Math.max(-0.5, Math.min(0.5, -by / 700)), by < 0 ? ray : undefined); // away from the target, not from the pointer
+    this.take();
+  }
+
+  press(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const act = { KeyR: () => this.home(), KeyF: () => this.whole(), BracketLeft: () => this.step(-1), BracketRight: () => this.step(1),
+      KeyL: () => this.writeHash(), KeyH: () => this.show("ask", "help"), Escape: () => this.show("ask", "help", false), KeyP: () => this.flyAround() }[event.code];
+    if (act) act();
+    else if (/^(Key[WASDQE]|Arrow)/.test(event.code) && !/^(INPUT|SECTION)$/.test(event.target.tagName)) (this.keys.add(event.code), this.take());
+    this.wake();
+  }
+
+  home() { this.index = this.settings.index; this.flyTo(this.settings.pose); }
+
+  step(by) {
+    const n = this.settings.poses.length;
+    this.index = (this.index + by + n) % n;
+    this.flyTo(this.settings.poses[this.index]);
+  }
+
+  whole() { document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.(); }
+
+  flyAround() {
+    this.flight = this.flight === null && this.settings.flight.length > 1 ? 0 : null;
+    this.jump = null;
+    this.wake();
+  }
+
+  flyTo(pose) {
+    if (isCalm() || !this.renderer) return this.setPose(pose);
+    this.flight = null;
+    this.held = false;
+    this.jump = { from: { ...this.camera.pose(), fov: this.fov, aspect: this.aspect }, to: { ...pose, fov: pose.fov ?? this.settings.fov }, part: 0 };
+    this.wake();
+  }
+
+  // A pose of the capture: {position, rotation, fov, aspect}; fov is vertical, in degrees, and it and the aspect may be left out.
+  setPose(pose) {
+    this.flight = this.jump = null;
+    this.place(pose);
+    this.held = true;
+    this.wake();
+  }
+
+  place(pose) {
+    this.camera.set(pose);
+    this.fov = pose.fov ?? this.settings.fov;
+    this.aspect = pose.aspect ?? this.aspect ?? this.settings.pose.aspect;
+    this.fit();
+  }
+
+  pose() { return { ...this.camera.pose(), fov: this.fov }; }
+
+  // The field of view that this screen has: a wide screen is filled by the photograph, a narrow one shows about half more of its width.
+  fit() {
+    const screen = innerWidth / innerHeight, ratio = this.aspect ? this.aspect / screen : 1, factor = ratio < 1 ? ratio : Math.sqrt(ratio);
+    const tan = Math.tan((this.fov * Math.PI) / 360);
+    this.shown = Math.min(WIDEST, (360 / Math.PI) * Math.atan(factor * tan));
+    const share = tan / Math.tan((this.shown * Math.PI) / 360); // of the screen's height that the photograph has
+    this.veil.style.setProperty("--edge", `${(50 * (1 - Math.min(1, share))).toFixed(2)}%`);
+  }
+
+  readHash() {
+    const parts = new URLSearchParams(location.hash.slice(1));
+    const numbers = (name, count) => {
+      const found = (parts.get(name) ?? "").split(",").map(Number);
+      return found.length === count && found.every(Number.isFinite) ? found : null;
+    };
+    const [position, r, fov] = [numbers("position", 3), numbers("rotation", 9), numbers("fov", 1)]; // an absent field of view reads as 0
+    if (position && r) this.setPose({ position, rotation: [r.slice(0, 3), r.slice(3, 6), r.slice(6)], fov: fov?.[0] > 0 && fov[0] < 180 ? fov[0] : undefined });
+  }
+
+  writeHash() {
+    const { position, rotation, fov } = this.pose(), text = (list) => list.map((v) => +v.toPrecision(7)).join(",");
+    history.replaceState(null, "", `#position=${text(position)}&rotation=${text(rotation.flat())}&fov=${+fov.toFixed(3)}`);
+  }
+
+  resize() {
+    if (!this.canvas) return;
+    const ratio = Math.min(devicePixelRatio, 2, LARGEST / Math.max(innerWidth, innerHeight));
+    this.canvas.width = Math.max(1, Math.round(innerWidth * ratio));
+    this.canvas.height = Math.max(1, Math.round(innerHeight * ratio));
+    this.canvas.style.cssText = "width:100vw;height:100vh";
+    this.fit();
+    this.wake();
+  }
+
+  view(scale = 1) {
+    const width = Math.max(1, Math.round(this.canvas.width * scale)), height = Math.max(1, Math.round(this.canvas.height * scale));
+    return viewOf(this.camera.pose(), this.shown, width, height, this.settings.nearest);
+  }
+
+  // Moves the camera by what keys, hands, a flight or a jump ask for. Returns whether it moved.
+  move(seconds) {
+    const { camera, settings, keys } = this, on = (...names) => (names.some((name) => keys.has(name)) ? 1 : 0);
+    if (this.jump) {
+      const { from, to } = this.jump, part = (this.jump.part = Math.min(1, this.jump.part + seconds / JUMP));
+      if (part < 1) this.place(between(from, to, part * part * (3 - 2 * part)));
+      else this.setPose(to);
+      return true;
+    }
+    if (this.flight !== null) {
+      const n = settings.flight.length, at = (this.flight = (this.flight + (seconds * n) / FLIGHT) % n), i = Math.floor(at);
+      this.place(between(settings.flight[i], settings.flight[(i + 1) % n], at - i));
+      this.held = true;
+      return true;
+    }
+    const fly = [on("KeyD", "ArrowRight") - on("KeyA", "ArrowLeft"), on("KeyQ") - on("KeyE"), on("KeyW", "ArrowUp") - on("KeyS", "ArrowDown")];
+    const flies = fly.some(Boolean), moved = camera.step(seconds);
+    if (flies) camera.fly(fly.map((v) => v * settings.speed * seconds));
+    if (moved || flies) this.stay(flies);
+    return moved || flies;
+  }
+
+  // Moves a camera that left the photographs to the nearest point within reach of one.
+  stay(flies) {
+    if (!this.near.checked) return;
+    const { position } = this.camera;
+    let nearest = null, least = Infinity;
+    for (const pose of this.settings.poses) {
+      const distance = length(add(pose.position, position, -1));
+      if (distance < least) [nearest, least] = [pose.position, distance];
+    }
+    if (least <= this.settings.reach) return;
+    const back = add(nearest, add(position, nearest, -1), this.settings.reach / least);
+    if (flies) this.camera.position = back;
+    else this.camera.moveTo(back);
+  }
+
+  wake() {
+    this.news = performance.now();
+    this.wishes = (this.wishes ?? 0) + 1;
+    if (this.running) return;
+    this.running = true;
+    this.last = null;
+    requestAnimationFrame((now) => this.frame(now));
+  }
+
+  async frame(now) {
+    const { wishes } = this, passed = this.last === null ? 0 : now - this.last, moves = this.move(Math.min(passed / 1000, 0.1));
+    this.last = now;
+    if (moves) this.news = performance.now();
+    const isResting = performance.now() - this.news >= REST || this.held && !moves;
+    if (passed && moves) this.adapt(passed);
+    this.veil.classList.toggle("on", this.held);
+    const { renderer } = this;
+    if (renderer) await renderer.draw(this.view(isResting ? 1 : this.scale), !isResting).catch(() => {}); // a lost device is told elsewhere
+    this.frames += 1;
+    this.running = moves || !isResting || wishes !== this.wishes; // somebody asked while this frame was drawn
+    if (this.running) requestAnimationFrame((next) => this.frame(next));
+  }
+
+  // The resolution follows the time of a frame while the camera moves.
+  adapt(milliseconds) {
+    this.mean = 0.8 * (this.mean ?? milliseconds) + 0.2 * milliseconds;
+    if (this.mean > SLOW) (this.scale = Math.max(LEAST, this.scale * 0.85)), (this.mean = null);
+    else if (this.mean < QUICK && this.scale < 1) (this.scale = Math.min(1, this.scale * 1.1)), (this.mean = null);
+  }
+
+  // Resolves once the picture of the present pose is final.
+  async settled() {
+    await this.loaded;
+    do await new Promise((done) => setTimeout(done, 50));
+    while (this.running || !this.renderer?.isFinal);
+    return true;
+  }
+}
