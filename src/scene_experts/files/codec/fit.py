@@ -8,14 +8,14 @@ they are linear). Weights that save less than they cost become zero.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from scene_experts.core.threads import one_thread
 from scene_experts.files.codec.groups import CLASS, MOST_FACTOR, MOST_OFFSET, SLOTS, UNIT, ChannelGroup, GroupModel, Walk, inputs_of
 from scene_experts.files.codec.order import CodingOrder
 from scene_experts.files.codec.reference import Ints
@@ -27,17 +27,6 @@ PER_STEP = 4  # anchors for each step, at least: few anchors cannot tell more
 PRICE = 8.0  # bits, of each unit of the size of a weight (in deviations); spread over the anchors
 _MEAN, _SPREAD = 64.0, 6  # units of a weight of the mean; shift of those of the spread
 _OCTAVE = 8 / math.log(2)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Sums in torch in one order, whatever the number of threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def fit_models(groups: Sequence[ChannelGroup], order: CodingOrder, values: Mapping[str, Ints]) -> dict[str, GroupModel]:

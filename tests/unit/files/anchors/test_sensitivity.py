@@ -7,7 +7,7 @@ import torch
 
 from scene_experts.core.types import Mode
 from scene_experts.files.anchors import sensitivity
-from scene_experts.files.anchors.sensitivity import evenly, fingerprint, keep, kept, measure
+from scene_experts.files.anchors.sensitivity import fingerprint, keep, kept, measure
 from scene_experts.render import choose
 from scene_experts.training.run_folder import OpenRun
 from support.files import run_in_memory
@@ -53,7 +53,3 @@ def test_a_precision_is_kept_with_its_scene_only(tmp_path):
     assert kept(run) is None and fingerprint(run.scene) != before
     (tmp_path / sensitivity.FILE).write_bytes(b"torn")
     assert kept(run) is None and isinstance(run, OpenRun)
-
-
-def test_evenly_chosen():
-    assert evenly(range(10), 4) == [0, 3, 6, 9] and evenly([5, 6], 4) == [5, 6]
