@@ -115,6 +115,10 @@ class Format:
     the run, in the frame of its capture. capture: None where it is gone. None: contents are written
     as they are, and those options are refused."""
 
+    prepare: Callable[..., str] | None = None
+    """prepare(run, capture, rasterize, device): measures at the end of a training what `fit` needs,
+    and keeps it in the run folder. Returns a sentence about it."""
+
     @property
     def is_folder(self) -> bool:
         """Whether it is the result folder of a family and not a file."""

@@ -14,13 +14,13 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from scene_experts.core.errors import RunError
+from scene_experts.core.logistic import logistic_bits
 from scene_experts.core.schedule import Rate, passes
 from scene_experts.core.threads import one_thread
 from scene_experts.scene import Scene
@@ -35,7 +35,6 @@ SHARE, LEAST = 0.06, 256  # of the anchors that a step looks at; and at least so
 EVERY = 250  # iterations from one removal of closed anchors to the next
 ERROR_PER_LOSS = 1 / 66
 """Mean square error for a unit of the loss, about, of pictures with 35 dB; for the first steps."""
-FLOOR = 1e-5  # probability that every value has at least
 CLASSES = HIGH_CLASS - LOW_CLASS + 1
 
 
@@ -88,31 +87,6 @@ class RateModel(nn.Module):
         mean, spread = (torch.einsum("nd,spd->snp", x, self.weights * self.used) + (self.biases * self.varies)[:, None]).unbind(0)
         away = (values - self.middle - self.deviation * mean) / steps + noise
         return logistic_bits(away, spread + self.deviation.log() - log_steps)
-
-
-def logistic_bits(away: Tensor, log_spread: Tensor) -> Tensor:
-    """Return the bits of the bin of width 1 around `away` under a logistic distribution around 0:
-    -log2((1 - 20 e) (sigma((away + 1/2) / s) - sigma((away - 1/2) / s)) + e), s = e^log_spread, e =
-    FLOOR. Of one shape."""
-    return _LogisticBits.apply(away, log_spread)  # type: ignore[no-any-return]
-
-
-class _LogisticBits(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, away: Tensor, log_spread: Tensor) -> Tensor:
-        inverse, u = torch.exp(-log_spread), -away.abs()  # both sigmoids are small on this side, and their difference is exact
-        upper, lower = (u + 0.5) * inverse, (u - 0.5) * inverse
-        a, b = upper.sigmoid(), lower.sigmoid()
-        share = (a - b) * (1 - 20 * FLOOR) + FLOOR
-        da, db = a * (1 - a), b * (1 - b)
-        factor = -(1 - 20 * FLOOR) / math.log(2) / share
-        ctx.save_for_backward(-(da - db) * inverse * factor * away.sign(), -(upper * da - lower * db) * factor)
-        return -share.log2()
-
-    @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> tuple:
-        by_away, by_spread = ctx.saved_tensors
-        return upstream[0] * by_away, upstream[0] * by_spread
 
 
 class RateTerm:

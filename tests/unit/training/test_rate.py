@@ -8,13 +8,14 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.logistic import logistic_bits
 from scene_experts.data.settings import Data
 from scene_experts.native import library as native
 from scene_experts.scene.anchors.quantise import HIGH_CLASS, KEEP, LOW_CLASS, ROUNDED
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig, check
 from scene_experts.training.events import Stepped
-from scene_experts.training.rate import EVERY, FLOOR, RateModel, RateTerm, first_iteration, logistic_bits, values_of
+from scene_experts.training.rate import EVERY, RateModel, RateTerm, first_iteration, values_of
 from scene_experts.training.recipes import RECIPES
 from scene_experts.training.shards import check_shard
 from support.lanes import slow_except
@@ -31,17 +32,6 @@ def folder(tmp_path_factory) -> Path:
 def rated(recipe="scene-experts", rate=0.01, **changes):
     """A short training whose rate begins after iteration 20 of 80."""
     return config(recipe, iterations=80, rate=rate, **changes)
-
-
-def test_bits_are_those_of_the_bins_of_a_logistic_distribution():
-    away, log_spread = torch.tensor([0.0, 0.3, -2.0, 40.0], dtype=torch.float64), torch.tensor([0.5, -1.0, 0.2, 0.0], dtype=torch.float64)
-    cdf = lambda x, s: 1 / (1 + math.exp(-x / s))  # noqa: E731
-    for a, t, bits in zip(away.tolist(), log_spread.tolist(), logistic_bits(away, log_spread).tolist()):
-        share = cdf(a + 0.5, math.exp(t)) - cdf(a - 0.5, math.exp(t))
-        assert bits == pytest.approx(-math.log2(share * (1 - 20 * FLOOR) + FLOOR))
-    torch.manual_seed(0)
-    leaves = [(3 * torch.randn(20, dtype=torch.float64)).requires_grad_(), torch.randn(20, dtype=torch.float64).requires_grad_()]
-    assert torch.autograd.gradcheck(logistic_bits, leaves)
 
 
 def test_each_value_sees_the_class_and_the_values_before_it():

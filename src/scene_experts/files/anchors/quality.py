@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import cast
 
 import torch
@@ -175,6 +175,7 @@ def choose_precision(
             quality *= NETWORKS
         judge = Judge(run, world.seen_from(origin_of(run, world)), views, rasterize)
 
+        @cache
         def loss(at: float) -> float:
             return judge.loss(rounded(contents, unit.at(2.0**at)))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,13 +15,14 @@ from torch import Tensor
 from scene_experts.core.checkpoint import read_tensors, write_tensors
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.types import Camera
+from scene_experts.data.capture import Capture
 from scene_experts.files.anchors.data import FILE_NAMES
 from scene_experts.files.anchors.precision import ROUNDED, Precision, from_sensitivity, is_exact
 from scene_experts.files.measure import Tell
 from scene_experts.render import Rasterizer
 from scene_experts.scene.anchors.scene import AnchorScene
 from scene_experts.training.run_folder import OpenRun
-from scene_experts.training.sensitivity import find_sensitivity
+from scene_experts.training.sensitivity import MOST_VIEWS, evenly, find_sensitivity
 
 FILE = "precision.safetensors"
 """In a run folder: the steps of an error of 1 at the newest export."""
@@ -28,8 +30,8 @@ KIND, VERSION = "precision", 1
 
 
 def measure(scene: AnchorScene, step: int, cameras: Sequence[Camera], background: Tensor, rasterize: Rasterizer, tell: Tell) -> Precision:
-    """The steps of an error of 1 of a scene on the CPU, from its pictures at `cameras` over
-    `background` [3]."""
+    """The steps of an error of 1 of a scene, from its pictures at `cameras` over `background`
+    [3]."""
     named = {f"params.{name}": scene.table.params[name] for name in ROUNDED}
     for name, value in scene.network_tensors().items():
         part, _, rest = name.partition(".")
@@ -39,9 +41,26 @@ def measure(scene: AnchorScene, step: int, cameras: Sequence[Camera], background
     def tell_views(done: int, total: int) -> None:
         tell("measuring what each value does to the pictures", done, total)
 
-    means = find_sensitivity(scene, values, step, cameras, background, rasterize, tell_views)
+    found = find_sensitivity(scene, values, step, cameras, background, rasterize, tell_views)
+    means = {name: value.cpu() for name, value in found.items()}
     columns = {name: means.pop(f"params.{name}") for name in ROUNDED}
     return from_sensitivity(columns, means)
+
+
+def prepare(run: OpenRun, capture: Capture, rasterize: Rasterizer, device: str) -> str:
+    """Measure the precision of a run on a device and keep it in the run folder. Returns a sentence
+    about it. See `registry.Format.prepare`."""
+    scene, begun = cast(AnchorScene, run.scene), time.process_time()
+    if not len(scene.table) or not capture.train:
+        return ""
+    cameras = [capture.views[i].camera.to(device) for i in evenly(capture.train, MOST_VIEWS)]
+    scene.to(device)
+    try:
+        precision = measure(scene, run.step, cameras, torch.tensor(capture.background, device=device), rasterize, lambda *_: None)
+    finally:
+        scene.to("cpu")
+    keep(run, precision)
+    return f"measured what each value does to the pictures, for exports as compact files ({time.process_time() - begun:.0f} s of CPU time)"
 
 
 def fingerprint(scene: AnchorScene) -> int:
