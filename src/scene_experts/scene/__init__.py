@@ -164,6 +164,10 @@ class Scene(nn.Module):
         classes: [N] int64; scale: of the world. The default refuses: `SceneConfig.can_round`."""
         raise ValueError(f"expected a scene whose values can be rounded, found one of {self.traits.rows}")
 
+    def forget_rounding(self) -> None:
+        """Forget the steps that an earlier training has learned, before another one moves the
+        values. The default does nothing."""
+
     def settled(self) -> Scene:
         """Return the scene that is evaluated and exported: what a training only imitates, such as
         rounded values, is done for good. The default is the scene itself."""

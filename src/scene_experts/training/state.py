@@ -129,7 +129,9 @@ class Training:
         torch.manual_seed(cfg.seed)
         try:
             with guarding(run, RUN):
-                training = cls(cfg, restore_foreign(cfg.scene, tensors, meta, averaged=True).to(device))
+                scene = restore_foreign(cfg.scene, tensors, meta, averaged=True).to(device)
+                scene.forget_rounding()
+                training = cls(cfg, scene)
         except InputError as error:
             if other := _changes(before.train.scene, now.train.scene, "scene"):
                 raise InputError(f"expected a scene of the kind that {run} of --init-from has{other}; use the flags of that run") from error

@@ -361,6 +361,10 @@ class AnchorScene(LatticeScene):
         if table.averages:
             table.averages[KEEP] = table.params[KEEP].detach().clone()
 
+    def forget_rounding(self) -> None:
+        self.steps = None
+        self.table.facts.pop(CLASS, None)
+
     @torch.no_grad()
     def settled(self) -> AnchorScene:
         rounding = self.rounding
