@@ -3,21 +3,19 @@
 The loss of a step is L + rate * B / P. B is the mean number of bits of an anchor's values under a
 model that is learned beside the scene, and P the number of values of an anchor. The model is that
 of compact files (`files.codec`) in floating point: a value has a logistic distribution whose mean
-and spread are linear in the level and class of the anchor, in its values that are coded before and
-in those of its parents (Balle et al. 2018; HAC, Chen et al. 2024, learns such models with a scene).
-A random share of the anchors stands for all; uniform noise stands for the rounding. Masks see the
-mean price of a slot and of an anchor at every step.
+and spread are linear in the class of the anchor and in its values that are coded before (Balle et
+al. 2018; HAC, Chen et al. 2024, learns such models with a scene). A random share of the anchors
+stands for all; uniform noise stands for the rounding. Masks see the mean price of a slot and of an
+anchor at every step.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -25,8 +23,6 @@ from scene_experts.core.errors import RunError
 from scene_experts.core.logistic import logistic_bits
 from scene_experts.core.schedule import Rate, passes
 from scene_experts.core.threads import one_thread
-from scene_experts.geometry.coding_order import LEVELS, order_rows
-from scene_experts.geometry.morton import AXIS_BITS
 from scene_experts.scene import Scene
 from scene_experts.scene.anchors.quantise import HIGH_CLASS, KEEP, LOW_CLASS, ROUNDED, STEPS, RowRounding, channels, find_steps, price_masks
 from scene_experts.strategy import Strategy
@@ -40,7 +36,6 @@ EVERY = 250  # iterations from one removal of closed anchors to the next
 ERROR_PER_LOSS = 1 / 66
 """Mean square error for a unit of the loss, about, of pictures with 35 dB; for the first steps."""
 CLASSES = HIGH_CLASS - LOW_CLASS + 1
-KNOWN = CLASSES + LEVELS  # inputs before those that are values
 
 
 def first_iteration(growth: Strategy, iterations: int) -> int:
@@ -64,15 +59,13 @@ class RateModel(nn.Module):
 
     def __init__(self, F: int, K: int) -> None:
         super().__init__()
-        self.F, P, own = F, channels(F, K), F + 6
-        D = KNOWN + 2 * own
+        self.F, P, D = F, channels(F, K), CLASSES + F + 6
         self.weights, self.biases = nn.Parameter(torch.zeros(2, P, D)), nn.Parameter(torch.zeros(2, P))
         used, varies = torch.zeros(2, P, D), torch.ones(2, P)
-        used[:, :, :KNOWN] = 1
+        used[:, :, :CLASSES] = 1
         for c in range(P):
-            used[:, c, KNOWN : KNOWN + min(c, own)] = 1
-        used[:, :F, KNOWN + own : KNOWN + own + F] = used[:, F:own, KNOWN + own + F :] = 1
-        used[0, own:] = varies[0, own:] = 0  # nothing predicts the mean of an offset
+            used[:, c, CLASSES : CLASSES + min(c, F + 6)] = 1
+        used[0, F + 6 :] = varies[0, F + 6 :] = 0  # nothing predicts the mean of an offset
         for name, value in (("middle", torch.zeros(P)), ("deviation", torch.ones(P)), ("used", used), ("varies", varies)):
             self.register_buffer(name, value)
 
@@ -83,24 +76,17 @@ class RateModel(nn.Module):
         self.deviation.copy_(values.std(0, correction=0) + 1e-6)
         self.biases[1].fill_(math.log(0.55))  # spread of a logistic distribution of deviation 1
 
-    def forward(self, values: Tensor, log_steps: Tensor, classes: Tensor, level: Tensor, parents: Tensor, noise: Tensor) -> Tensor:
+    def forward(self, values: Tensor, log_steps: Tensor, classes: Tensor, noise: Tensor) -> Tensor:
         """Return the bits [n, P] of values [n, P] whose steps have the logarithms [n, P]. classes
-        [n]; level [n], parents [n, F + 6]: `inputs` of the parents; noise [n, P] within half a step.
-        Values that predict others have no gradient by it."""
-        steps = log_steps.exp()
+        [n]; noise [n, P] within half a step. Values that predict others have no gradient by it."""
+        steps, known = log_steps.exp(), self.F + 6
         with torch.no_grad():
-            own = self.inputs(values[:, : self.F + 6], steps[:, : self.F + 6])
-            known = functional.one_hot(classes - LOW_CLASS, CLASSES), functional.one_hot(level, LEVELS)
-            x = torch.cat([*(k.to(own.dtype) for k in known), own, parents], 1)
+            rounded = torch.round(values[:, :known] / steps[:, :known]) * steps[:, :known]
+            own = (rounded - self.middle[:known]) / self.deviation[:known]
+            x = torch.cat([functional.one_hot(classes - LOW_CLASS, CLASSES).to(own.dtype), own], 1)
         mean, spread = (torch.einsum("nd,spd->snp", x, self.weights * self.used) + (self.biases * self.varies)[:, None]).unbind(0)
         away = (values - self.middle - self.deviation * mean) / steps + noise
         return logistic_bits(away, spread + self.deviation.log() - log_steps)
-
-    def inputs(self, values: Tensor, steps: Tensor) -> Tensor:
-        """Return what predicts others of values [..., F + 6] with steps of that shape: they are
-        rounded, and in deviations from the middle."""
-        known = self.F + 6
-        return (torch.round(values / steps) * steps - self.middle[:known]) / self.deviation[:known]
 
 
 class RateTerm:
@@ -112,7 +98,6 @@ class RateTerm:
         self.weight, self.seed, self.iterations = weight, seed, iterations
         self.first = first_iteration(growth, iterations)
         self.model: RateModel | None = None
-        self.order: tuple[Tensor, tuple[Tensor, Tensor, Tensor]] | None = None  # of the rows with these cells, `order_rows`
 
     def is_due(self, step: int) -> bool:
         """Whether the rate begins with the iteration `step`, or has been missed."""
@@ -172,7 +157,7 @@ class RateTerm:
         rows = rows.to(scene.table.device)
         values = values_of(scene, rows).requires_grad_()
         with torch.enable_grad():
-            bits = self._bits(scene, rounding, model, rows, values, noise)
+            bits = self._bits(rounding, model, rows, values, noise)
             term = bits.sum() * (self.weight / (P * max(len(rows), 1)))
             term.backward()
         assert values.grad is not None
@@ -190,26 +175,12 @@ class RateTerm:
             keep.grad = price if keep.grad is None else keep.grad + price
         return term.detach()
 
-    def _bits(self, scene: Scene, rounding: RowRounding, model: RateModel, rows: Tensor, values: Tensor, noise: Tensor) -> Tensor:
+    def _bits(self, rounding: RowRounding, model: RateModel, rows: Tensor, values: Tensor, noise: Tensor) -> Tensor:
         """The bits [n, P] of rows [n], 0 for values that no file holds."""
         classes, opened = rounding.classes.index_select(0, rows), rounding.open.index_select(0, rows)
         log_steps = rounding.log_steps + classes[:, None] * math.log(2)
         held = torch.cat([opened.any(1, keepdim=True).expand(-1, model.F + 6), opened.repeat_interleave(3, 1)], 1)
-        level, parents = self._context(scene, rounding, model, rows)
-        return model(values, log_steps, classes, level, parents, noise) * held
-
-    @torch.no_grad()
-    def _context(self, scene: Scene, rounding: RowRounding, model: RateModel, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """The levels [n] of rows [n], and the weighted means [n, F + 6] of their parents' inputs."""
-        own, cells = model.F + 6, scene.table.facts["cell"]
-        if self.order is None or self.order[0] is not cells:
-            level, parents, weights = (torch.from_numpy(a).to(cells.device) for a in order_rows(fine_cells(scene)))
-            self.order = cells, (level, parents, weights)
-        level, parents, weights = (a.index_select(0, rows) for a in self.order[1])
-        flat = parents.flatten()
-        steps = (rounding.log_steps[:own] + rounding.classes.index_select(0, flat)[:, None] * math.log(2)).exp()
-        found = model.inputs(values_of(scene, flat, ROUNDED[:2]), steps).view(*parents.shape, own)
-        return level, (found * weights[..., None]).sum(1)
+        return model(values, log_steps, classes, noise) * held
 
     def _prices(self, rounding: RowRounding, rows: Tensor, bits: Tensor) -> tuple[float, float]:
         """The mean bits of an open slot, and of the other values of an anchor with one."""
@@ -228,19 +199,9 @@ class RateTerm:
         return scene.table.drop(closed)
 
 
-def fine_cells(scene: Scene) -> NDArray[np.int64]:
-    """Return the cells [N, 3] of rows on the finest lattice, from 0 to 2^21; coarser ones for wide
-    scenes."""
-    xyz = scene.positions.detach().cpu().double()
-    away = xyz - (xyz.min(0).values if len(xyz) else 0)
-    edge = max(scene.traits.voxel, float(away.max()) / ((1 << AXIS_BITS) - 2) if len(xyz) else 1.0)
-    return (away / edge).round().long().numpy()
-
-
-def values_of(scene: Scene, rows: Tensor | None = None, names: Sequence[str] = ROUNDED) -> Tensor:
-    """Return the values [n, F + 6 + 3 K] of rows [n], or of all, as they are learned. names: of the
-    columns."""
-    columns = [scene.table.params[name].detach() for name in names]
+def values_of(scene: Scene, rows: Tensor | None = None) -> Tensor:
+    """Return the values [n, F + 6 + 3 K] of rows [n], or of all, as they are learned."""
+    columns = [scene.table.params[name].detach() for name in ROUNDED]
     return torch.cat([(c if rows is None else c.index_select(0, rows)).flatten(1) for c in columns], 1)
 
 

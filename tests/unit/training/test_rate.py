@@ -4,20 +4,18 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.logistic import logistic_bits
 from scene_experts.data.settings import Data
-from scene_experts.geometry.coding_order import order_rows
 from scene_experts.native import library as native
 from scene_experts.scene.anchors.quantise import HIGH_CLASS, KEEP, LOW_CLASS, ROUNDED
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig, check
 from scene_experts.training.events import Stepped
-from scene_experts.training.rate import EVERY, RateModel, RateTerm, fine_cells, first_iteration, values_of
+from scene_experts.training.rate import EVERY, RateModel, RateTerm, first_iteration, values_of
 from scene_experts.training.recipes import RECIPES
 from scene_experts.training.shards import check_shard
 from support.lanes import slow_except
@@ -46,18 +44,14 @@ def test_each_value_sees_the_class_and_the_values_before_it():
         model.middle.normal_()
     values, classes = torch.randn(4, 15, dtype=torch.float64), torch.tensor([LOW_CLASS, 0, 1, HIGH_CLASS])
     log_steps = torch.full((4, 15), -1.0, dtype=torch.float64) + classes[:, None] * math.log(2)
-    level, parents = torch.tensor([0, 1, 2, 2]), torch.randn(4, F + 6, dtype=torch.float64)
-    bits = model(values, log_steps, classes, level, parents, torch.zeros(4, 15))
+    bits = model(values, log_steps, classes, torch.zeros(4, 15))
     for i in range(4):
         step = math.exp(-1) * 2.0 ** int(classes[i])
-        x = torch.zeros(7 + 3 + 2 * (F + 6), dtype=torch.float64)
-        x[int(classes[i]) - LOW_CLASS] = x[7 + int(level[i])] = 1
+        x = torch.zeros(7 + F + 6, dtype=torch.float64)
+        x[int(classes[i]) - LOW_CLASS] = 1
         own = torch.round(values[i, : F + 6] / step) * step - model.middle[: F + 6]
         for c in range(15):
-            x[10 : 10 + F + 6] = torch.where(torch.arange(F + 6) < c, own, 0.0)
-            seen = slice(0, F) if c < F else slice(F, F + 6) if c < F + 6 else slice(0, 0)  # of the group itself
-            x[10 + F + 6 :] = 0
-            x[10 + F + 6 :][seen] = parents[i, seen]
+            x[7:] = torch.where(torch.arange(F + 6) < c, own, 0.0)
             mean = model.middle[c] + (model.weights[0, c] @ x + model.biases[0, c] if c < F + 6 else 0.0)
             spread = model.weights[1, c] @ x + model.biases[1, c]
             wanted = logistic_bits((values[i, c] - mean) / step, spread - math.log(step))
@@ -73,8 +67,7 @@ def test_gradients_are_finite_differences():
     context = values.clone()  # values that predict others are held: only those of the last channels are free
     free = (context[:, 8:]).clone().requires_grad_()
     log_steps = torch.full((3, 11), -1.5, dtype=torch.float64)
-    level, parents = torch.tensor([0, 2, 1]), torch.randn(3, 8, generator=g, dtype=torch.float64)
-    total = lambda last: model(torch.cat([context[:, :8], last], 1), log_steps, classes, level, parents, noise).sum()  # noqa: E731
+    total = lambda last: model(torch.cat([context[:, :8], last], 1), log_steps, classes, noise).sum()  # noqa: E731
     assert torch.autograd.gradcheck(total, [free])
     for parameter in (model.weights, model.biases):
         (exact,) = torch.autograd.grad(total(free.detach()), parameter)
@@ -120,22 +113,6 @@ def test_the_term_is_bits_per_value_and_its_gradients_are_added():
     assert (added[KEEP] > 0).all() and float(added[KEEP][1, 0]) > float(
         added[KEEP][2, 0]
     )  # two slots share the price of an anchor, not ten
-
-
-def test_parents_predict_as_they_are_rounded():
-    scene, term = begun()
-    rounding, model = scene.rounding, term.model
-    cells = fine_cells(scene)
-    assert cells.min() == 0 and len(np.unique(cells, axis=0)) == len(scene.table)
-    level, parents, weights = order_rows(cells)
-    steps = torch.exp(rounding.log_steps.detach()[:38] + rounding.classes[:, None] * math.log(2))
-    rounded = (torch.round(values_of(scene)[:, :38] / steps) * steps - model.middle[:38]) / model.deviation[:38]
-    rows = torch.tensor([5, 100, 7])
-    found, mean = term._context(scene, rounding, model, rows)
-    assert found.tolist() == level[rows].tolist()
-    for i, row in enumerate(rows.tolist()):
-        wanted = sum(float(w) * rounded[p] for p, w in zip(parents[row], weights[row]))
-        torch.testing.assert_close(mean[i], wanted, rtol=1e-4, atol=1e-5)
 
 
 def test_it_begins_where_growth_ends_or_half_way():

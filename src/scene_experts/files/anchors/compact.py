@@ -34,11 +34,11 @@ from scene_experts.files.codec import container
 from scene_experts.files.codec.fit import fit_models
 from scene_experts.files.codec.groups import EXTRA, FEATURE, OFFSETS, ORDER, SCALING, SLOTS, Walk, anchor_groups
 from scene_experts.files.codec.numbers import Rounded, code_models, code_rounded, reading, writing
+from scene_experts.files.codec.order import CodingOrder, choose_boxes
 from scene_experts.files.codec.streams import SymbolReader, SymbolWriter
 from scene_experts.files.measure import Tell
 from scene_experts.files.options import Options
 from scene_experts.files.registry import Format
-from scene_experts.geometry.coding_order import CodingOrder, choose_boxes
 from scene_experts.render import Rasterizer
 from scene_experts.training.run_folder import OpenRun
 

@@ -21,7 +21,7 @@ from scene_experts.files.anchors.data import AnchorData
 from scene_experts.files.codec.numbers import STEP
 from scene_experts.files.codec.reference import Ints
 from scene_experts.files.codec.streams import SymbolReader, SymbolWriter
-from scene_experts.geometry.morton import AXIS_BITS, Keys, morton, unmorton
+from scene_experts.files.formats.morton import AXIS_BITS, Keys, morton, unmorton
 
 FARTHEST_CELL = 1 << 52  # coordinate of a cell
 MOST_LATTICES = 64

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_experts.core.reading.budget import Damaged
+from scene_experts.files.codec.order import LEVELS, CodingOrder
 from scene_experts.files.codec.reference import Ints
 from scene_experts.files.codec.streams import MOST_INPUTS, SymbolReader, SymbolWriter, as_inputs, blend, predict
-from scene_experts.geometry.coding_order import LEVELS, CodingOrder
 from scene_experts.scene.anchors.quantise import HIGH_CLASS, LOW_CLASS
 
 CLASSES = HIGH_CLASS - LOW_CLASS + 1

@@ -302,3 +302,15 @@ def as_inputs(values: Ints, classes: NDArray[np.int8], factor: int, offset: int)
 def blend(columns: NDArray[np.int16], parents: Ints, weights: Ints) -> NDArray[np.int16]:
     """The weighted means [C, n] of columns [C, N] at parents [n, 4]; weights [n, 4] in 1/256."""
     return ((columns[:, parents].astype(np.int64) * weights).sum(2) >> 8).astype(np.int16)
+
+
+def find_parents(cells: Ints, rows: Ints, coarse: Ints) -> tuple[Ints, Ints]:
+    """The two rows before and the two after each of rows [n] among coarse [m], both ascending, and
+    their weights by the distance of cells [N, 3]: [n, 4] both."""
+    place = np.searchsorted(coarse, rows)[:, None] + np.arange(-2, 2)
+    there = (place >= 0) & (place < len(coarse))
+    parents = np.where(there, coarse[place.clip(0, max(len(coarse) - 1, 0))], 0) if len(coarse) else np.zeros_like(place)
+    away = np.abs(cells[rows][:, None].astype(np.int64) - cells[parents]).sum(2)
+    share = np.where(there, 65536 // (away + 1), 0)
+    total = share.sum(1, keepdims=True)
+    return parents.astype(np.int32), np.where(total > 0, share * 256 // np.maximum(total, 1), 0).astype(np.int32)

@@ -173,3 +173,14 @@ def blend(columns: NDArray[np.int16], parents: Ints, weights: Ints, slow: bool =
     out = np.empty((len(columns), len(parents)), np.int16)
     library.se_code_blend(_at(columns), columns.shape[1], len(columns), _at(parents), _at(weights), len(parents), _at(out))
     return out
+
+
+def find_parents(cells: Ints, rows: Ints, coarse: Ints, slow: bool = False) -> tuple[Ints, Ints]:
+    """`reference.find_parents`."""
+    library = None if slow else native.load()
+    if library is None:
+        return reference.find_parents(cells, rows, coarse)
+    cells, rows, coarse = (np.ascontiguousarray(a, np.int32) for a in (cells, rows, coarse))
+    parents, weights = np.empty((len(rows), 4), np.int32), np.empty((len(rows), 4), np.int32)
+    library.se_code_parents(_at(cells), _at(rows), len(rows), _at(coarse), len(coarse), _at(parents), _at(weights))
+    return parents, weights

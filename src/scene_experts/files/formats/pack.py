@@ -15,8 +15,8 @@ from torch import Tensor
 
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.source import Source
+from scene_experts.files.formats.morton import AXIS_BITS, morton
 from scene_experts.files.formats.splats import Splats
-from scene_experts.geometry.morton import AXIS_BITS, morton
 
 log: logging.Logger = logging.getLogger(__name__)
 Floats = NDArray[np.float64]

@@ -7,8 +7,8 @@ import torch
 from scene_experts.files.codec import fit
 from scene_experts.files.codec.fit import fit_models, one_thread, split
 from scene_experts.files.codec.groups import Walk, anchor_groups
-from scene_experts.geometry.coding_order import CodingOrder, choose_boxes
-from scene_experts.geometry.morton import morton
+from scene_experts.files.codec.order import CodingOrder, choose_boxes
+from scene_experts.files.formats.morton import morton
 
 F, K, N = 3, 1, 1500
 

@@ -6,8 +6,8 @@ import pytest
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.files.codec import groups
 from scene_experts.files.codec.groups import GroupModel, Walk, anchor_groups, inputs_of
-from scene_experts.geometry.coding_order import CodingOrder
-from scene_experts.geometry.morton import morton
+from scene_experts.files.codec.order import CodingOrder
+from scene_experts.files.formats.morton import morton
 
 F, K, N = 5, 2, 60
 

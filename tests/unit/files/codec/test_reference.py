@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scene_experts.files.codec import reference
-from scene_experts.geometry.morton import morton, unmorton
+from scene_experts.files.formats.morton import morton, unmorton
 
 
 def test_constants_are_the_rounded_powers_of_two():

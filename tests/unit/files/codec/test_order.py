@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from scene_experts.core.reading.budget import Damaged
-from scene_experts.geometry.coding_order import CodingOrder, choose_boxes, find_parents, order_rows
-from scene_experts.geometry.morton import morton
+from scene_experts.files.codec.order import CodingOrder, choose_boxes
+from scene_experts.files.formats.morton import morton
 
 
 def keys(n=500):
@@ -30,28 +30,6 @@ def test_the_slow_form_is_the_same():
     found = keys(90)
     fast, slow = (CodingOrder.of(found, (9, 6), slow) for slow in (False, True))
     assert all(np.array_equal(a, b) for x, y in zip(fast.parents, slow.parents) for a, b in zip(x, y))
-
-
-def test_parents_are_the_two_before_and_after_by_both_forms():
-    rng = np.random.default_rng(0)
-    cells = rng.integers(0, 1 << 21, (400, 3)).astype(np.int32)
-    rows, coarse = np.arange(1, 400, 2, dtype=np.int32), np.arange(0, 400, 8, dtype=np.int32)
-    for some in (coarse, coarse[:1], coarse[:0]):
-        found, wanted = find_parents(cells, rows, some), find_parents(cells, rows, some, slow=True)
-        assert all(np.array_equal(a, b) for a, b in zip(found, wanted)) and (found[1].sum(1) <= 256).all()
-    assert find_parents(cells, rows, coarse)[0][100].tolist() == [192, 200, 208, 216]
-
-
-def test_the_order_by_rows_of_a_table():
-    cells = np.random.default_rng(0).integers(0, 60, (300, 3))
-    level, parents, weights = order_rows(cells)
-    order = np.argsort(morton(cells), kind="stable")
-    way = CodingOrder.of(morton(cells)[order], choose_boxes(morton(cells)[order]))
-    for number, places in enumerate(way.levels):
-        assert (level[order[way.rows[places]]] == number).all()
-        wanted = order[way.rows[way.parents[number][0]]]
-        assert np.array_equal(parents[order[way.rows[places]]], wanted)
-    assert (weights[level == 0] == 0).all() and (level[parents][weights > 0] < np.repeat(level[:, None], 4, 1)[weights > 0]).all()
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scene_experts.geometry.morton import AXIS_BITS, morton, unmorton
+from scene_experts.files.formats.morton import AXIS_BITS, morton, unmorton
 
 TOP = (1 << AXIS_BITS) - 1
 

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_experts.core.reading.budget import Damaged
-from scene_experts.geometry.morton import Keys, morton, unmorton
-from scene_experts.native import library as native
-
-Ints = NDArray[np.int32]
+from scene_experts.files.codec.reference import Ints
+from scene_experts.files.codec.streams import find_parents
+from scene_experts.files.formats.morton import Keys, unmorton
 
 LEVELS = 3
 SHARES = (1 / 12, 1 / 3)  # of all anchors, at most: on level 0, and on levels 0 and 1
@@ -73,36 +72,3 @@ class CodingOrder:
             found, weights = find_parents(cells, own, np.flatnonzero(level < number).astype(np.int32), slow)
             parents.append((place[found] if len(keys) else found, weights))
         return cls(order, np.cumsum([len(own) for own in rows]).tolist(), parents)
-
-
-def find_parents(cells: Ints, rows: Ints, coarse: Ints, slow: bool = False) -> tuple[Ints, Ints]:
-    """The two rows before and the two after each of rows [n] among coarse [m], both ascending, and
-    their weights by the distance of cells [N, 3]: [n, 4] both. slow: with numpy, the definition."""
-    library = None if slow else native.load()
-    if library is not None:
-        cells, rows, coarse = (np.ascontiguousarray(a, np.int32) for a in (cells, rows, coarse))
-        parents, weights = np.empty((len(rows), 4), np.int32), np.empty((len(rows), 4), np.int32)
-        at = [a.__array_interface__["data"][0] for a in (cells, rows, coarse, parents, weights)]
-        library.se_code_parents(at[0], at[1], len(rows), at[2], len(coarse), *at[3:])
-        return parents, weights
-    place = np.searchsorted(coarse, rows)[:, None] + np.arange(-2, 2)
-    there = (place >= 0) & (place < len(coarse))
-    parents = np.where(there, coarse[place.clip(0, max(len(coarse) - 1, 0))], 0) if len(coarse) else np.zeros_like(place)
-    away = np.abs(cells[rows][:, None].astype(np.int64) - cells[parents]).sum(2)
-    share = np.where(there, 65536 // (away + 1), 0)
-    total = share.sum(1, keepdims=True)
-    return parents.astype(np.int32), np.where(total > 0, share * 256 // np.maximum(total, 1), 0).astype(np.int32)
-
-
-def order_rows(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
-    """The level [N] of each row of cells [N, 3] from 0 to 2^21, the rows of its parents [N, 4] and their
-    weights [N, 4], whose sum is about 1, or 0 on level 0."""
-    keys, n = morton(cells), len(cells)
-    along = np.argsort(keys, kind="stable")
-    way = CodingOrder.of(keys[along], choose_boxes(keys[along]))
-    rows, level = along[way.rows], np.zeros(n, np.int64)
-    parents, weights = np.zeros((n, 4), np.int64), np.zeros((n, 4), np.float32)
-    for number, places in enumerate(way.levels):
-        own, (found, share) = rows[places], way.parents[number]
-        level[own], parents[own], weights[own] = number, rows[found], share / 256
-    return level, parents, weights
