@@ -18,7 +18,6 @@ from scene_experts.training.events import Stepped
 from scene_experts.training.rate import EVERY, RateModel, RateTerm, first_iteration, values_of
 from scene_experts.training.recipes import RECIPES
 from scene_experts.training.shards import check_shard
-from support.lanes import slow_except
 from support.scenes import start_scene
 from support.synthetic import make_capture
 from support.trainings import assert_same, config, events, last_tensors
@@ -29,9 +28,12 @@ def folder(tmp_path_factory) -> Path:
     return make_capture(tmp_path_factory.mktemp("capture"), views=16).folder
 
 
+METHODS = ("scene-experts", "moe-gs", "octree-gs", "scaffold-gs-bank")
+
+
 def rated(recipe="scene-experts", rate=0.01, **changes):
-    """A short training whose rate begins after iteration 20 of 80."""
-    return config(recipe, iterations=80, rate=rate, **changes)
+    """A short training whose rate begins half way."""
+    return config(recipe, iterations=24, rate=rate, **changes)
 
 
 def test_each_value_sees_the_class_and_the_values_before_it():
@@ -125,14 +127,14 @@ def test_it_begins_where_growth_ends_or_half_way():
 
 
 @pytest.mark.skipif(native.load() is None, reason="no compiled library")
-@pytest.mark.parametrize("recipe", slow_except(("scene-experts", "moe-gs", "octree-gs", "scaffold-gs-bank"), "scene-experts"))
-def test_resumed_equals_uninterrupted_bit_for_bit(recipe, folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("scene_experts.training.rate.EVERY", 20)
-    cfg = rated(recipe, rate=0.3, average=replace(RECIPES[recipe][1].average, span=0.2))
-    seen = [e for e in events(cfg, folder, tmp_path / "whole", log_every=10) if isinstance(e, Stepped)]
-    assert ["rate" in e.terms for e in seen][::7] == [False, True]
-    for stop in (10, 50, 80):
-        list(events(cfg, folder, tmp_path / "parts", stop_at=stop, resume=stop > 10))
+@pytest.mark.parametrize(("recipe", "iterations"), [("scaffold-gs", 12), *(pytest.param(r, 80, marks=pytest.mark.slow) for r in METHODS)])
+def test_resumed_equals_uninterrupted_bit_for_bit(recipe, iterations, folder, tmp_path, monkeypatch):
+    monkeypatch.setattr("scene_experts.training.rate.EVERY", iterations // 4)
+    cfg = config(recipe, iterations=iterations, rate=0.3, average=replace(RECIPES[recipe][1].average, span=0.2))
+    seen = [e for e in events(cfg, folder, tmp_path / "whole", log_every=iterations // 4) if isinstance(e, Stepped)]
+    assert ["rate" in e.terms for e in seen][::3] == [False, True]
+    for stop in (iterations // 4, 3 * iterations // 4, iterations):
+        list(events(cfg, folder, tmp_path / "parts", stop_at=stop, resume=stop > iterations // 4))
     assert_same(last_tensors(tmp_path / "whole"), last_tensors(tmp_path / "parts"))
     tensors = last_tensors(tmp_path / "whole")
     assert tensors["rate.biases"].any() and "average.params.keep" in tensors
