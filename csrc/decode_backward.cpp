@@ -67,7 +67,8 @@ class Backward {
     for (int a = 0; a < chunk.n; ++a) {
       const float* gradient = w_.feature + int64_t(a) * s_.Fp;
       copy_row(gradient, s_.F, d_.d_feature + d_.rows[begin + a] * s_.F);
-      if (d_.steps) add_step_gradients(gradient, w_.z + int64_t(a) * s_.Z, d_.feature + d_.rows[begin + a] * s_.F, s_.F, sums_ + layout_.steps);
+      const float* exact = d_.feature + d_.rows[begin + a] * s_.F;
+      if (d_.steps) add_step_gradients(gradient, w_.z + int64_t(a) * s_.Z, exact, s_.F, sums_ + layout_.steps);
     }
   }
 
