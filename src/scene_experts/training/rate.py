@@ -6,7 +6,7 @@ of compact files (`files.codec`) in floating point: a value has a logistic distr
 and spread are linear in the class of the anchor and in its values that are coded before (Balle et
 al. 2018; HAC, Chen et al. 2024, learns such models with a scene). A random share of the anchors
 stands for all; uniform noise stands for the rounding. Masks see the mean price of a slot and of an
-anchor of their class at every step.
+anchor at every step.
 """
 
 from __future__ import annotations
@@ -104,8 +104,9 @@ class RateTerm:
         return self.model is None and step > self.first
 
     def begin(self, scene: Scene, sensitivity: Mapping[str, Tensor], scale: float) -> dict[str, list[nn.Parameter]]:
-        """Round the values of a scene from now on. Returns the new parameters by the names of their
-        learning rates. sensitivity: of the columns, `find_sensitivity`; scale: of the world."""
+        """Round the values of a scene from now on. sensitivity: of the columns, `find_sensitivity`;
+        scale: of the world.
+        Returns the new parameters by the names of their learning rates."""
         with one_thread():
             steps, classes = find_steps({name: value.detach().cpu() for name, value in sensitivity.items()})
         flat = torch.cat([steps[name] for name in ROUNDED])
@@ -181,17 +182,11 @@ class RateTerm:
         held = torch.cat([opened.any(1, keepdim=True).expand(-1, model.F + 6), opened.repeat_interleave(3, 1)], 1)
         return model(values, log_steps, classes, noise) * held
 
-    def _prices(self, rounding: RowRounding, rows: Tensor, bits: Tensor) -> tuple[Tensor, Tensor]:
-        """The mean bits of an open slot, and of the other values of an anchor with one, of the class
-        of each anchor: [N, 1] both. Classes that the rows [n] lack have the mean of all."""
-        opened, own = rounding.open.index_select(0, rows).to(bits), len(rounding.log_steps) - 3 * rounding.keep.shape[1]
-        member = functional.one_hot(rounding.classes.index_select(0, rows) - LOW_CLASS, CLASSES).to(bits)
-        counts = torch.stack([opened.sum(1), opened.amax(1)], 1)
-        spent = torch.stack([bits[:, own:].sum(1), bits[:, :own].sum(1)], 1)
-        some, of_class = counts.sum(0).clamp_min(1), member.T @ counts
-        mean = torch.where(of_class > 0, (member.T @ spent) / of_class.clamp_min(1), spent.sum(0) / some)
-        slot, anchor = mean.index_select(0, rounding.classes - LOW_CLASS).split(1, 1)
-        return slot, anchor
+    def _prices(self, rounding: RowRounding, rows: Tensor, bits: Tensor) -> tuple[float, float]:
+        """The mean bits of an open slot, and of the other values of an anchor with one."""
+        opened, own = rounding.open.index_select(0, rows), len(rounding.log_steps) - 3 * rounding.keep.shape[1]
+        slots, anchors = max(int(opened.sum()), 1), max(int(opened.any(1).sum()), 1)
+        return float(bits[:, own:].sum()) / slots, float(bits[:, :own].sum()) / anchors
 
     def drop_closed(self, scene: Scene, step: int, views: int) -> int:
         """Remove the anchors without an open slot, every 250 iterations. Returns their number.

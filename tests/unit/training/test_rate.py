@@ -117,25 +117,6 @@ def test_the_term_is_bits_per_value_and_its_gradients_are_added():
     )  # two slots share the price of an anchor, not ten
 
 
-def test_prices_are_means_of_a_class():
-    scene, term = begun()
-    keep, rounding = scene.table.params[KEEP], scene.rounding
-    keep.data.normal_(generator=torch.Generator().manual_seed(0))
-    keep.data[:5] = -1.0
-    rounding.classes[:] = torch.arange(len(keep)) % 3
-    rows = torch.arange(0, 60, 2)
-    bits = torch.rand(len(rows), 68)
-    opened = rounding.open[rows].float()
-    bits *= torch.cat([opened.amax(1, keepdim=True).expand(-1, 38), opened.repeat_interleave(3, 1)], 1)
-    slot, anchor = term._prices(rounding, rows, bits)
-    for k in (0, 1, 2):
-        own = rounding.classes[rows] == k
-        torch.testing.assert_close(slot[k, 0], bits[own, 38:].sum() / opened[own].sum())
-        torch.testing.assert_close(anchor[k, 0], bits[own, :38].sum() / opened[own].amax(1).sum())
-    rounding.classes[-1] = 4  # no row of the sample has it
-    torch.testing.assert_close(term._prices(rounding, rows, bits)[0][-1, 0], bits[:, 38:].sum() / opened.sum())
-
-
 def test_it_begins_where_growth_ends_or_half_way():
     for recipe, wanted in (("scene-experts", 1400), ("octree-gs", None), ("scaffold-gs", 1400)):
         cfg = replace(RECIPES[recipe][1], iterations=3000).scaled()

@@ -187,10 +187,10 @@ class _OpenThrough(torch.autograd.Function):
         return upstream[0], d_keep.view_as(keep), None
 
 
-def price_masks(keep: Tensor, slot: Tensor, anchor: Tensor) -> Tensor:
+def price_masks(keep: Tensor, slot: float, anchor: float) -> Tensor:
     """The gradient [N, K] of the price of all open slots by the logits of masks [N, K], with
-    sigmoid(m) in place of the step: each slot pays its own price and its share of its anchor's,
-    [N, 1] both. Closed slots pay what they would cost if they were open."""
+    sigmoid(m) in place of the step: each slot pays its own price and its share of its anchor's.
+    Closed slots pay what they would cost if they were open."""
     share, opened = keep.sigmoid(), (keep > 0).sum(1, keepdim=True)
     return share * (1 - share) * (slot + anchor / opened.clamp_min(1))
 
