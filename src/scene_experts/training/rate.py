@@ -104,9 +104,8 @@ class RateTerm:
         return self.model is None and step > self.first
 
     def begin(self, scene: Scene, sensitivity: Mapping[str, Tensor], scale: float) -> dict[str, list[nn.Parameter]]:
-        """Round the values of a scene from now on. sensitivity: of the columns, `find_sensitivity`;
-        scale: of the world.
-        Returns the new parameters by the names of their learning rates."""
+        """Round the values of a scene from now on. Returns the new parameters by the names of their
+        learning rates. sensitivity: of the columns, `find_sensitivity`; scale: of the world."""
         with one_thread():
             steps, classes = find_steps({name: value.detach().cpu() for name, value in sensitivity.items()})
         flat = torch.cat([steps[name] for name in ROUNDED])
