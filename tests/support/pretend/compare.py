@@ -9,7 +9,7 @@ difference of a colour from the photograph. The L1 loss has a kink at 0: where a
 decides the sign of its gradient.
 RECIPE:alone: both train on their own. Then `gradients` is empty.
 RECIPE:unchanged: as RECIPE, and the training starts as it is, without the change that follows.
-RECIPE:rate: as RECIPE, with --rate from the first step on. The first step is the CPU's alone.
+RECIPE:rate: as RECIPE, with --rate from the first step on, on both.
 
 A training as it starts has equal depths (`start_changed` says why), so the parameters are changed a little before the first step.
 Densification is off: it draws random numbers on the device of the scene.
@@ -116,8 +116,6 @@ def compare(capture: Capture, word: str) -> dict[str, list[float]]:
         alone = Steps(start_changed(cfg, capture, "cuda"), capture, "cuda", on_cuda)
         found["losses"] = [abs(alone.take() / plain.take() - 1) for _ in range(TEN)]
         return found
-    if how == "rate":
-        plain.take()
     for _ in range(TEN):
         plain.save()
         same, loss = plain.copy("cuda", on_cuda), plain.take()
