@@ -12,6 +12,10 @@
 // that its weights stay in the L1 cache (products.h). Covariance and colour are computed only for anchors that
 // draw something. Gradients of weights are summed in at most BUFFERS partial buffers over fixed ranges of
 // chunks, then in a fixed order, which gives the same bits for every number of threads.
+//
+// With steps, values are rounded where they are gathered: v becomes r((v - o) / s) s + o, s = step times factor. The
+// gradient of v is that of the rounded value (straight-through), and the gradient of the logarithm of a step is
+// the sum of gradient times (rounded value - v) (Esser et al. 2020).
 #pragma once
 #include <cstdint>
 #include <vector>
@@ -86,6 +90,7 @@ struct Work {
   float* weights;                 // [CHUNK][shares]: gradient of the mixture weights
   float* size;                    // [CHUNK][8]: exp(l) of offsets, 1, of scales, 1
   float* spread;                  // [CHUNK * K][3]
+  float* row;                     // [3 K]: rounded offsets of an anchor
   float* weight;                  // lists: mixture weight, [CHUNK * shares]
   int *anchor, *place;            // lists: index in the chunk; anchor * shares + index of the expert
   uint64_t* bits;                 // one bit per slot of the chunk: it is drawn
@@ -128,8 +133,16 @@ inline void for_each_drawn(const Work& w, int K, int anchor, F&& f) {
     for (uint32_t bits = drawn_slots(w, K, anchor, slot); bits; bits &= bits - 1) f(slot + __builtin_ctz(bits));
 }
 
+// Round n values to origin plus multiples of steps times factor.
+void round_row(const float* from, const float* steps, float factor, float origin, int n, float* to);
+// The six log-scalings of a row as they are drawn.
+void round_scaling(const Decode& d, int64_t row, float* to);
+// Add gradient (rounded - exact) to the gradients of the logarithms of n steps.
+void add_step_gradients(const float* gradient, const float* rounded, const float* exact, int n, float* to);
+// The offsets [3 K] of a row as they are drawn.
+const float* find_offsets(const Decode& d, int64_t row, Work& w);
 void gather(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w);
-void find_drawn(const Decode& d, const Chunk& chunk, Work& w);  // fill bits and live from raw
+void find_drawn(const Decode& d, const Chunk& chunk, Work& w);  // fill bits and live from raw and slots
 void compute_sizes(const Decode& d, const Chunk& chunk, Work& w);
 // Group the anchors of the chunk by expert; with `live_only`, only those that draw something.
 void group_by_expert(const Decode& d, const Head& head, const Chunk& chunk, bool live_only, Work& w, std::vector<Group>& found);
@@ -149,6 +162,7 @@ void differentiate_routing(const Decode& d, const Sizes& s, const Chunk& chunk, 
 // Write the Gaussians of a chunk from its mixed outputs; and the gradients of the outputs from those of the
 // Gaussians.
 void emit_gaussians(const Decode& d, const Sizes& s, const Chunk& chunk, int64_t first, Work& w);
-void differentiate_gaussians(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w);
+// step_sums: [F + 6 + 3 K], where the gradients of steps are added; unused without steps.
+void differentiate_gaussians(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w, float* step_sums);
 
 }  // namespace se

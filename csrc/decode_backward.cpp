@@ -18,7 +18,7 @@ struct Layout {
     int64_t w1t, wm, bm, w2, b2;  // [inputs][Hp] with the bias as an input, [L][H][Hp], [L][Hp], [out][Hp], [Op]; rows padded to 16
   };
   std::vector<Expert> experts[3];
-  int64_t router = 0, router_b = 0, total = 0;  // [R][routerp], [Rp]
+  int64_t router = 0, router_b = 0, steps = 0, total = 0;  // [R][routerp], [Rp], [F + 6 + 3 K]
   Layout(const Decode& d, const Sizes& s) {
     const auto take = [&](int64_t floats) { return (total += floats) - floats; };
     for (int i = 0; i < 3; ++i)
@@ -33,6 +33,7 @@ struct Layout {
       }
     router = take(int64_t(s.Rp) * s.routerp);
     router_b = take(s.Rp);
+    steps = take(d.steps ? round_up(s.F + 6 + 3 * s.K, 16) : 0);
   }
 };
 
@@ -59,11 +60,16 @@ class Backward {
     const Chunk chunk{begin, static_cast<int>(end - begin)};
     gather(d_, s_, chunk, w_);
     find_drawn(d_, chunk, w_);
-    differentiate_gaussians(d_, s_, chunk, w_);
+    differentiate_gaussians(d_, s_, chunk, w_, sums_ + layout_.steps);
     std::fill_n(w_.feature, int64_t(chunk.n) * s_.Fp, 0.f);
     for (int i = 0; i < 3; ++i) differentiate_head(chunk, i);
     if (s_.R) differentiate_router(chunk);
-    for (int a = 0; a < chunk.n; ++a) copy_row(w_.feature + int64_t(a) * s_.Fp, s_.F, d_.d_feature + d_.rows[begin + a] * s_.F);
+    for (int a = 0; a < chunk.n; ++a) {
+      const float* gradient = w_.feature + int64_t(a) * s_.Fp;
+      copy_row(gradient, s_.F, d_.d_feature + d_.rows[begin + a] * s_.F);
+      const float* exact = d_.feature + d_.rows[begin + a] * s_.F;
+      if (d_.steps) add_step_gradients(gradient, w_.z + int64_t(a) * s_.Z, exact, s_.F, sums_ + layout_.steps);
+    }
   }
 
  private:
@@ -261,5 +267,6 @@ SE_EXPORT int32_t se_decode_backward(const Decode* decode) {
     });
     for_each_expert(d, [&](int i, int e) { write_expert(d, s, layout.experts[i][e], sums, i, e); });
     write_routers(d, s, layout, sums);
+    if (d.steps) std::copy_n(sums + layout.steps, s.F + 6 + 3 * s.K, d.d_log_steps);
   });
 }

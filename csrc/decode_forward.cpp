@@ -69,6 +69,11 @@ SE_EXPORT int32_t se_decode_begin(const Decode* decode) {
     int64_t drawn = 0;
     for (int a = 0; a < chunk.n; ++a) {
       copy_row(w.mixed[0] + int64_t(a) * s.Op[0], s.K, d.raw + (chunk.begin + a) * s.K);
+      if (d.slots) {
+        const uint8_t* open = d.slots + d.rows[chunk.begin + a] * s.K;
+        for (int slot = 0; slot < s.K; ++slot) drawn += w.mixed[0][int64_t(a) * s.Op[0] + slot] > 0.f && open[slot];
+        continue;
+      }
       for (int slot = 0; slot < s.K; slot += LANES)
         drawn += __builtin_popcount(find_positive(load_part(w.mixed[0] + int64_t(a) * s.Op[0] + slot, std::min(LANES, s.K - slot))));
     }

@@ -15,7 +15,7 @@ void emit_gaussians(const Decode& d, const Sizes& s, const Chunk& chunk, int64_t
     if (!w.live[a]) continue;
     const int64_t row = d.rows[chunk.begin + a];
     const F32x4 x = load3(d.xyz + row * 3), reach = load4(w.size + 8 * a), size = load4(w.size + 8 * a + 4);
-    const float *offsets = d.offsets + row * K * 3, *raw = d.raw + (chunk.begin + a) * K;
+    const float *offsets = find_offsets(d, row, w), *raw = d.raw + (chunk.begin + a) * K;
     const float *cov = w.mixed[1] + int64_t(a) * s.Op[1], *color = w.mixed[2] + int64_t(a) * s.Op[2];
     for_each_drawn(w, K, a, [&](int slot) {
       const F32x4 q = load4(cov + COV * slot + 3);
@@ -57,7 +57,7 @@ void clear_gap(const Decode& d, int64_t anchor) {
 
 }  // namespace
 
-void differentiate_gaussians(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w) {
+void differentiate_gaussians(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w, float* step_sums) {
   const int K = s.K;
   compute_sizes(d, chunk, w);
   int64_t at = d.starts[chunk.begin / CHUNK];
@@ -78,7 +78,7 @@ void differentiate_gaussians(const Decode& d, const Sizes& s, const Chunk& chunk
       const F32x4 reach = load4(w.size + 8 * a), inverse = broadcast4(1.f) / load4(w.size + 8 * a + 4);
       zero_row(cov, s.Op[1]);
       zero_row(color, s.Op[2]);
-      const float* offsets = d.offsets + row * K * 3;
+      const float* offsets = find_offsets(d, row, w);
       for_each_drawn(w, K, a, [&](int slot) {
         if (d.d_opacities) {  // not added to the value just stored: a load after a wider masked store stalls
           const float g = d.d_opacities[at] + (d_raw ? d_raw[slot] : 0.f);
@@ -107,9 +107,15 @@ void differentiate_gaussians(const Decode& d, const Sizes& s, const Chunk& chunk
         }
         ++at;
       });
+      if (d.steps) add_step_gradients(d_offsets, offsets, d.offsets + row * K * 3, 3 * K, step_sums + d.F + 6);
     }
     store3(d.d_log_scaling + row * 6, to_reach);
     store3(d.d_log_scaling + row * 6 + 3, to_size);
+    if (d.steps) {
+      float rounded[6];
+      round_scaling(d, row, rounded);
+      add_step_gradients(d.d_log_scaling + row * 6, rounded, d.log_scaling + row * 6, 6, step_sums + d.F);
+    }
   }
 }
 

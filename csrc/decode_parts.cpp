@@ -101,6 +101,7 @@ Work::Work(const Sizes& s) {
                            take(int64_t(CHUNK) * s.shares + LANES),
                            take(8 * CHUNK),
                            take(3 * int64_t(CHUNK) * s.K + LANES),
+                           take(3 * s.K),
                            take(int64_t(CHUNK) * s.shares),
                            take(int64_t(CHUNK) * s.shares),
                            take(int64_t(CHUNK) * s.shares),
@@ -112,9 +113,35 @@ Work::Work(const Sizes& s) {
   z = base + parts[0], block = base + parts[1], hidden = base + parts[2], out = base + parts[3];
   for (int i = 0; i < 3; ++i) mixed[i] = base + parts[4 + i];
   logits = base + parts[7], feature = base + parts[8], weights = base + parts[9], size = base + parts[10];
-  spread = base + parts[11], weight = base + parts[12];
-  anchor = reinterpret_cast<int*>(base + parts[13]), place = reinterpret_cast<int*>(base + parts[14]);
-  bits = reinterpret_cast<uint64_t*>(base + parts[15]), live = reinterpret_cast<uint8_t*>(base + parts[16]);
+  spread = base + parts[11], row = base + parts[12], weight = base + parts[13];
+  anchor = reinterpret_cast<int*>(base + parts[14]), place = reinterpret_cast<int*>(base + parts[15]);
+  bits = reinterpret_cast<uint64_t*>(base + parts[16]), live = reinterpret_cast<uint8_t*>(base + parts[17]);
+}
+
+void round_row(const float* from, const float* steps, float factor, float origin, int n, float* to) {
+  const Vec scale = broadcast(factor), start = broadcast(origin);
+  for (int i = 0; i < n; i += LANES) {
+    const int m = std::min(LANES, n - i);
+    const bool whole = m == LANES;
+    const Vec step = (whole ? load(steps + i) : load_part(steps + i, m)) * scale, v = whole ? load(from + i) : load_part(from + i, m);
+    const Vec rounded = round_to_nearest((v - start) / step) * step + start;
+    whole ? store(to + i, rounded) : store_part(to + i, rounded, m);
+  }
+}
+
+void round_scaling(const Decode& d, int64_t row, float* to) {
+  round_row(d.log_scaling + row * 6, d.steps + d.F, d.factors[row], static_cast<float>(d.origin), 6, to);
+}
+
+void add_step_gradients(const float* gradient, const float* rounded, const float* exact, int n, float* to) {
+  for (int i = 0; i < n; ++i) to[i] += gradient[i] * (rounded[i] - exact[i]);
+}
+
+const float* find_offsets(const Decode& d, int64_t row, Work& w) {
+  const float* exact = d.offsets + row * d.K * 3;
+  if (!d.steps) return exact;
+  round_row(exact, d.steps + d.F + 6, d.factors[row], 0.f, static_cast<int>(3 * d.K), w.row);
+  return w.row;
 }
 
 void gather(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w) {
@@ -126,7 +153,10 @@ void gather(const Decode& d, const Sizes& s, const Chunk& chunk, Work& w) {
     for (int c = 0; c < s.F; c += 16) __builtin_prefetch(d.feature + next * s.F + c);
     __builtin_prefetch(d.xyz + next * 3);
     float* z = w.z + int64_t(a) * s.Z;
-    copy_row(d.feature + row * s.F, s.F, z);
+    if (d.steps)
+      round_row(d.feature + row * s.F, d.steps, d.factors[row], 0.f, s.F, z);
+    else
+      copy_row(d.feature + row * s.F, s.F, z);
     const F32x4 x = load3(d.xyz + row * 3), v = x - camera;
     const float distance = std::sqrt(dot(v, v));
     F32x4 direction = v * broadcast4(1.f / std::max(distance, 1e-12f));
@@ -144,6 +174,10 @@ void find_drawn(const Decode& d, const Chunk& chunk, Work& w) {
   int i = 0;
   for (; i + LANES <= count; i += LANES) w.bits[i >> 6] |= static_cast<uint64_t>(find_positive(load(raw + i))) << (i & 63);
   if (i < count) w.bits[i >> 6] |= static_cast<uint64_t>(find_positive(load_part(raw + i, count - i))) << (i & 63);
+  for (int a = 0; d.slots && a < chunk.n; ++a) {
+    const uint8_t* open = d.slots + d.rows[chunk.begin + a] * K;
+    for (int slot = 0; slot < K; ++slot) w.bits[(a * K + slot) >> 6] &= ~(static_cast<uint64_t>(!open[slot]) << ((a * K + slot) & 63));
+  }
   for (int a = 0; a < chunk.n; ++a) {
     uint32_t any = 0;
     for (int slot = 0; slot < K; slot += 32) any |= drawn_slots(w, K, a, slot);
@@ -154,6 +188,11 @@ void find_drawn(const Decode& d, const Chunk& chunk, Work& w) {
 void compute_sizes(const Decode& d, const Chunk& chunk, Work& w) {
   for (int a = 0; a < chunk.n; ++a) {
     const float* l = d.log_scaling + d.rows[chunk.begin + a] * 6;
+    float rounded[6];
+    if (d.steps) {
+      round_scaling(d, d.rows[chunk.begin + a], rounded);
+      l = rounded;
+    }
     store4(w.size + 8 * a, load3(l));
     store4(w.size + 8 * a + 4, load3(l + 3));
   }

@@ -97,6 +97,10 @@ typedef struct {
   int64_t* source;                                                             // [M], row * K + slot
   const float *d_means, *d_quats, *d_scales, *d_opacities, *d_colors, *d_raw;  // null: zero
   float *d_feature, *d_log_scaling, *d_offsets;                                // [N, ...]
+  const float *steps, *factors;  // [F + 6 + 3 K] [N]: values are rounded to multiples of steps times the row's factor; null: they are not
+  const uint8_t* slots;          // [N, K]: slots with 0 are not drawn; null: all may be
+  float* d_log_steps;            // [F + 6 + 3 K], of the logarithms of the steps; null without steps
+  double origin;                 // log-scalings are rounded to multiples from here on
   int64_t A, N, K, F, threads;
   int64_t ascending;      // 1 if `rows` ascend: the backward pass then writes zeros to all other rows of the table
   int64_t frozen;         // 1 if gates, chosen and chosen_weight are given, for all N rows

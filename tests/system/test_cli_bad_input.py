@@ -215,6 +215,7 @@ FLAGS = {
     "more chosen than there are": ["--scene.decoder.top-k", "9"],
     "unknown attribute": ["--scene.add-dist", "depth"],
     "start unknown": ["--init", "sparse"],
+    "rate below zero": ["--rate", "-1"],
     "resume without a run": ["--resume"],
     "resume and overwrite": ["--resume", "--overwrite"],
 }
@@ -324,6 +325,7 @@ OTHERS = {
     "export to an empty name, joined": ["export", "RUN", "--out="],
     "eval with weights from nowhere": ["eval", "RUN", "--lpips-weights", "TMP/absent"],
     "eval with a capture from nowhere": ["eval", "RUN", "--data", "TMP/absent"],
+    "rate of Gaussians": ["train", "3dgs", "--data", "MADE", "--out", "TMP/r", "--rate", "0.1"],
 }
 
 

@@ -72,6 +72,12 @@ def test_each_step_is_that_of_the_cpu(recipes, folder):
 
 
 @pytest.mark.slow
+def test_a_step_with_the_rate_is_that_of_the_cpu(folder):
+    found = passed(run(folder, "compare", "scaffold-gs:rate"))["scaffold-gs:rate"]
+    assert len(found["losses"]) == 10 and max(*found["losses"], *found["gradients"]) < CLOSE, found
+
+
+@pytest.mark.slow
 def test_a_step_differs_only_where_an_alpha_lies_on_its_threshold(folder):
     found = passed(run(folder, "compare", "moe-gs-e2-dense"))["moe-gs-e2-dense"]
     steps = list(zip(found["losses"], found["gradients"], found["close"]))

@@ -14,7 +14,7 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.core.fields import check_fields
 from scene_experts.data.capture import Capture
-from scene_experts.files.registry import exported_files
+from scene_experts.files.registry import exported_files, formats_of
 from scene_experts.files.result_folder import DESCRIPTION
 from scene_experts.files.scene_folder import result_warnings, write_result_folder
 from scene_experts.render import Rasterizer
@@ -58,7 +58,8 @@ def train(run: loop.Job, capture: Capture, rasterize: Rasterizer) -> Iterator[Ev
             if not complete:
                 if run.max_memory > 0:
                     give_back()
-                yield export_layout(run.out, capture)
+                exported = export_layout(run.out, capture)
+                yield replace(exported, notes=prepare_exports(run.out, capture, rasterize, run.device))
             yield finished
 
 
@@ -73,6 +74,15 @@ def export_layout(out: Path, capture: Capture) -> Exported:
     """Write the newest checkpoint of a run folder in the layout that other tools read."""
     opened = run_folder.open_run(out)
     return Exported(opened.step, write_result_folder(opened, capture), tuple(result_warnings(opened)))
+
+
+def prepare_exports(out: Path, capture: Capture, rasterize: Rasterizer, device: str) -> tuple[str, ...]:
+    """Measure what later exports of a trained run need and keep it in its folder. Returns a
+    sentence for each measurement."""
+    opened = run_folder.open_run(out)
+    formats = formats_of(opened.scene.traits.family).values()
+    made = [format.prepare(opened, capture, rasterize, device) for format in formats if format.prepare is not None]
+    return tuple(filter(None, made))
 
 
 def check_settings(run: loop.Job) -> None:

@@ -18,6 +18,7 @@ from scene_experts.data.blocks import Block, read_plan
 from scene_experts.data.views import same_poses
 from scene_experts.files.scene_folder import write_result_folder
 from scene_experts.scene import Scene
+from scene_experts.scene.anchors.quantise import CLASS
 from scene_experts.training import run_folder
 from scene_experts.training.run_folder import OpenRun
 
@@ -44,6 +45,8 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
     columns: dict[str, list[Tensor]] = {}
     networks: dict[str, Tensor] = {}
     lattice: dict[str, Any] = {}
+    masks: list[Tensor] = []
+    masked = False
     configs, step, seconds, poses = [], 0, 0.0, ""
     for number, path in enumerate(runs):  # one run in memory at a time
         run = run_folder.open_run(path)
@@ -57,10 +60,14 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
         poses = poses or run.poses
         _check_box(blocks, number, run)
         if not configs:
-            networks, lattice = {name: value.detach().clone() for name, value in scene.network_tensors().items()}, scene.meta()
+            networks, lattice = {name: value.detach().clone() for name, value in scene.network_tensors().items()}, _lattice(scene)
         _check_same(lattice, networks, scene, path)
         rows = blocks[number].holds(scene.positions.detach())
+        masks.append(scene.table.facts.get("slots", torch.ones(len(scene.table), scene.K, dtype=torch.bool))[rows])
+        masked |= "slots" in scene.table.facts
         for name, column in scene.table.columns().items():
+            if name in ("slots", CLASS):
+                continue
             kind = "params" if name in scene.table.params else "facts"
             columns.setdefault(f"{kind}.{name}", []).append(column.detach()[rows])
         configs.append(run.config)
@@ -69,6 +76,8 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
     tensors = {f"network.{name}": value for name, value in networks.items()}
     for name in list(columns):
         tensors[name] = torch.cat(columns.pop(name))
+    if masked:
+        tensors["facts.slots"] = torch.cat(masks)
     data = replace(configs[0].data, views=None)
     command = f"merged from {len(runs)} blocks"
     config = replace(configs[0], data=data, command=command, versions=run_folder.versions(), stop_at=None, init_from=None)
@@ -101,9 +110,15 @@ def _is_same_box(bounds: Sequence[float], block: Block) -> bool:
     return all(math.isclose(a, b, rel_tol=1e-5) for a, b in zip(bounds, block.bounds))  # a plan writes six digits
 
 
+def _lattice(scene: Scene) -> dict[str, Any]:
+    """`Scene.meta` without the steps that a block has learned with --rate, which differ between
+    blocks: the merged scene is rounded anew."""
+    return {name: value for name, value in scene.meta().items() if name != "steps"}
+
+
 def _check_same(lattice: dict[str, Any], networks: dict[str, Tensor], scene: Scene, path: Path) -> None:
     """Raise InputError unless a scene has this lattice and these networks."""
-    found = scene.meta()
+    found = _lattice(scene)
     if lattice != found:
         raise InputError(f"expected the lattice of the first block in {path}, found another; begin all blocks with the same --init-from")
     its = scene.network_tensors()

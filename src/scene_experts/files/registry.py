@@ -122,6 +122,10 @@ class Format:
     """draw(run, capture, options, rasterize, tell): the contents of a file of "drawn", in the
     capture's own frame, and how they were made."""
 
+    prepare: Callable[..., str] | None = None
+    """prepare(run, capture, rasterize, device): measures at the end of a training what `fit` needs,
+    and keeps it in the run folder. Returns a sentence about it."""
+
     @property
     def is_folder(self) -> bool:
         """Whether it is the result folder of a family and not a file."""

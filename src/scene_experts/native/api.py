@@ -12,7 +12,7 @@ import ctypes
 from ctypes import POINTER, Structure, c_double, c_float, c_int32, c_int64, c_void_p
 from typing import Any
 
-ABI_VERSION = 12
+ABI_VERSION = 13
 
 HEAD_TENSORS = ("router_w", "router_b", "w1", "b1", "middle_w", "middle_b", "w2", "b2")
 """The weights of a decoder head, in the order of `SeDecodeHead`."""
@@ -62,6 +62,8 @@ class SeDecode(Structure):
         *_fields(c_void_p, "rows", "xyz", "feature", "log_scaling", "offsets", "camera", "raw", "starts"),
         *_fields(c_void_p, *_GAUSSIANS, "per_length", "source"),
         *_fields(c_void_p, *(f"d_{name}" for name in (*_GAUSSIANS, "raw", "feature", "log_scaling", "offsets"))),
+        *_fields(c_void_p, "steps", "factors", "slots", "d_log_steps"),
+        *_fields(c_double, "origin"),
         *_fields(c_int64, "A", "N", "K", "F", "threads", "ascending", "frozen"),
         *_fields(c_double, "extent"),
         ("heads", SeDecodeHead * 3),

@@ -19,6 +19,7 @@ from scene_experts.core.types import Camera, Decoded, Mode, Points, Routing
 
 if TYPE_CHECKING:
     from scene_experts.scene.anchors.appearance import Codes
+    from scene_experts.scene.anchors.quantise import RowRounding
 
 Cull = Callable[[Tensor, Tensor, Camera], Tensor]
 """The rasteriser's visibility test: means [n, 3], scales [n, 3], camera -> [n] bool."""
@@ -153,6 +154,25 @@ class Scene(nn.Module):
         """
         return self
 
+    @property
+    def rounding(self) -> RowRounding | None:
+        """How values are rounded before they are drawn; None: they are drawn as they are."""
+        return None
+
+    def start_rounding(self, steps: Tensor, classes: Tensor, scale: float = 1.0) -> None:
+        """Draw values from now on as a compact file would hold them. steps: of all values of a row;
+        classes: [N] int64; scale: of the world. The default refuses: `SceneConfig.can_round`."""
+        raise ValueError(f"expected a scene whose values can be rounded, found one of {self.traits.rows}")
+
+    def forget_rounding(self) -> None:
+        """Forget the steps that an earlier training has learned, before another one moves the
+        values. The default does nothing."""
+
+    def settled(self) -> Scene:
+        """Return the scene that is evaluated and exported: what a training only imitates, such as
+        rounded values, is done for good. The default is the scene itself."""
+        return self
+
     def describe_decode(self, step: int) -> str:
         """Say which implementation decodes the scene at `step`, and why not the fastest. Empty for
         a scene with one."""
@@ -227,6 +247,11 @@ class SceneConfig(Part, ABC):
         """Last iteration of the experts' dense warm-up. 0 if there is none."""
         return 0
 
+    @property
+    def can_round(self) -> bool:
+        """Whether the scene has `Scene.start_rounding`, which --rate needs."""
+        return False
+
     def phases(self) -> dict[str, int]:
         """Return the last iteration of each phase that a training leaves for good, by the dotted
         path of the field that sets it."""
@@ -268,7 +293,7 @@ def restore_scene(config: SceneConfig, tensors: dict[str, Tensor], meta: dict[st
             Other tensors are ignored.
         meta: The values of `Scene.meta()`. Other values are ignored.
         averaged: Use the averages of the weights (`average.params.NAME`, `average.network.NAME`),
-            if there are any, in place of the last weights.
+            if there are any, in place of the last weights, and return the scene `settled`.
 
     Raises:
         InputError: The networks have other names or shapes than those of `config`.
@@ -283,7 +308,7 @@ def restore_scene(config: SceneConfig, tensors: dict[str, Tensor], meta: dict[st
     with torch.no_grad():
         for name, parameter in wanted.items():
             parameter.copy_(stored[name])
-    return scene
+    return scene.settled() if averaged else scene
 
 
 @dataclass(frozen=True)

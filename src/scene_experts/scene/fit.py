@@ -19,6 +19,7 @@ from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.numbers import FARTHEST, all_finite, expect_range, number, shown, whole_number
 from scene_experts.scene import Scene, SceneConfig, restore_scene
 from scene_experts.scene.anchors.levels import MOST_FORK, MOST_LEVELS, LevelRule
+from scene_experts.scene.anchors.quantise import CLASS, HIGH_CLASS, KEEP, LOW_CLASS
 
 _CREATE = (torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn)
 
@@ -77,11 +78,18 @@ def check_columns(shapes: dict[str, tuple[int, ...]], columns: dict[str, Tensor]
         whole = name in ("facts.cell", "facts.level")
         if columns[name].dtype != torch.int64 if whole else not columns[name].is_floating_point():
             raise Damaged(f"{name} of type {columns[name].dtype}")
-    optional = {"facts.interval": (), "facts.slots": shapes.get("params.offsets", (0,))[:1]}  # of the smoothing filter; of masked slots
+    slots = shapes.get("params.offsets", (0,))[:1]
+    optional = {"facts.interval": (), "facts.slots": slots, f"params.{KEEP}": slots, f"facts.{CLASS}": ()}  # of anchors
     for name in optional.keys() & columns.keys():
-        fits = columns[name].dtype == torch.bool if name == "facts.slots" else columns[name].is_floating_point()
+        kind = {"facts.slots": torch.bool, f"facts.{CLASS}": torch.int64}.get(name)
+        fits = columns[name].is_floating_point() if kind is None else columns[name].dtype == kind
         if not fits or tuple(columns[name].shape[1:]) != optional[name]:
             raise Damaged(f"{name} of shape {list(columns[name].shape)} and type {columns[name].dtype}")
+    classes = columns.get(f"facts.{CLASS}", torch.zeros(1))
+    if classes.numel() and not LOW_CLASS <= int(classes.min()) <= int(classes.max()) <= HIGH_CLASS:
+        raise Damaged(f"step classes out of {LOW_CLASS} to {HIGH_CLASS}")
+    if f"params.{KEEP}" in columns and f"facts.{CLASS}" not in columns:
+        raise Damaged("masks without step classes")
 
 
 def check_levels(meta: dict[str, Any], level: Tensor | None) -> None:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from scene_experts.arguments.option import Option
 from scene_experts.core.errors import InputError
-from scene_experts.core.fields import SCALES, Count, CountOrNone, Range, Share, changed_without, check_fields, flag_of, scale
+from scene_experts.core.fields import SCALES, Count, CountOrNone, NotNegative, Range, Share, changed_without, check_fields, flag_of, scale
 from scene_experts.core.parts import Part, find
 from scene_experts.data.settings import Data
 from scene_experts.scene import EXPLICIT, LearningRates, SceneConfig
@@ -77,6 +77,10 @@ class Train:
     sparse_adam: bool = False
     """Update only the rows that a view has decoded (SelectiveAdam of gsplat). Faster if views see a
     small part of the scene; changes the results."""
+    rate: NotNegative = 0.0
+    """Weight of the bits of a compact file in the loss, for recipes of anchors; 0.0005 saves a
+    sixth of the bytes and costs little. It counts once growth has ended, and from half of the
+    training on at the latest; 0: bits do not count."""
     schedule: Annotated[int, Option(hidden=True)] = SCHEDULE
     """The iterations that this recipe's windows are written for."""
 
@@ -136,6 +140,8 @@ def check(cfg: Train) -> None:
         )
     if cfg.rates.family != cfg.scene.family:
         raise InputError(f"expected learning rates for {cfg.scene.family}, found those for {cfg.rates.family}; use a recipe where they fit")
+    if cfg.rate and not cfg.scene.can_round:
+        raise InputError(f"expected a recipe of anchors for --rate, found one of {cfg.scene.grown_as}; use scene-experts, or leave it out")
     if cfg.sparse_adam and not cfg.optimizer.by_row:
         raise InputError("expected an optimiser that can move some rows only for --sparse-adam, found another; leave the flag out")
 

@@ -122,6 +122,8 @@ class Exported:
     """The folder RUN/point_cloud/iteration_N."""
     warnings: tuple[str, ...] = ()
     """What other readers of the layout get wrong, one sentence each."""
+    notes: tuple[str, ...] = ()
+    """What was measured for later exports, one sentence each."""
 
 
 @dataclass(frozen=True)

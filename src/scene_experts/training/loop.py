@@ -21,6 +21,7 @@ from scene_experts.data.capture import Capture
 from scene_experts.data.dense import NoDenseStartError, start_densely
 from scene_experts.render import Rasterizer, for_training
 from scene_experts.scene import Scene
+from scene_experts.scene.anchors.quantise import ROUNDED
 from scene_experts.strategy import Edit
 from scene_experts.strategy.survey import Survey, TrainingPhoto
 from scene_experts.training.batch import Direct, check_batch, make_exchange
@@ -32,6 +33,7 @@ from scene_experts.training.losses import Sample, compute_terms, load_dense, loa
 from scene_experts.training.memory import anchor_cap, give_back, peak_bytes
 from scene_experts.training.options import TrainOptions
 from scene_experts.training.resident import AHEAD, Resident
+from scene_experts.training.sensitivity import MOST_VIEWS, evenly, find_sensitivity
 from scene_experts.training.shards import Sharded, check_shard
 from scene_experts.training.state import Training, resume, save
 from scene_experts.training.trial import fit_memory
@@ -227,6 +229,7 @@ def iterate(training: Training, run: Job, capture: Capture, rasterize: Rasterize
     cfg, scene = training.cfg, training.scene
     exchange = exchange or Direct(training, run.group, run.stop)
     training.step += cfg.batch
+    begin_rate(training, capture, rasterize)
     training.set_rates()
     scene.begin_iteration(training.step - cfg.batch, training.step, training.companions)
     batch, numbers = training.next_batch(capture.train), training.views_of(training.step)
@@ -247,6 +250,10 @@ def iterate(training: Training, run: Job, capture: Capture, rasterize: Rasterize
     training.seed_view(training.step + 1)
     exchange.finish()
     rows = exchange.rows() if cfg.sparse_adam or run.shard else None
+    rate = training.rate if training.scene.rounding is not None else None
+    if rate is not None:
+        term, rows = rate.add_gradients(scene, training.step), None
+        done = replace(done, terms={**done.terms, "rate": term})
     if any(cfg.growth.reads(number) for number in numbers):
         exchange.complete()
     limited, before = run.max_memory > 0 and any(cfg.growth.adds(number) for number in numbers), len(scene.table)
@@ -265,9 +272,25 @@ def iterate(training: Training, run: Job, capture: Capture, rasterize: Rasterize
         give_back()
     exchange.compare(scene.table.total, bool(edits))
     training.optimizer_step(None if edits else rows)
+    if rate is not None and rate.drop_closed(scene, training.step, cfg.batch) and training.direct is not None:
+        training.direct.forget()
     cfg.growth.finish(scene, training.step, training.rates(), training.growth_rng)
     training.update_averages()
     return replace(done, edits=tuple(edits))
+
+
+def begin_rate(training: Training, capture: Capture, rasterize: Rasterizer) -> None:
+    """Begin the rate of a training with --rate when it is due: every process does the same."""
+    rate, scene = training.rate, training.scene
+    if rate is None or not rate.is_due(training.step):
+        return
+    columns, device = {name: scene.table.params[name] for name in ROUNDED}, scene.table.device
+    cameras = [capture.views[i].camera.to(device, columns["offsets"].dtype) for i in evenly(capture.train, MOST_VIEWS)]
+    background = torch.tensor(capture.background).to(columns["offsets"])
+    found = find_sensitivity(scene, columns, training.step, cameras, background, rasterize)
+    training.add_groups(rate.begin(scene, found, capture.world.scale))
+    if training.direct is not None:
+        training.direct.forget()
 
 
 def see_view(

@@ -94,6 +94,8 @@ class TrainingProgress:
                 self.print_line(f"stopped at iteration {event.step:,} ({event.reason}); {state}")
             case Exported():
                 self.print_line(f"wrote {event.path}")
+                for note in event.notes:
+                    self.print_line(note)
             case Finished():
                 if event.step > self.first:  # a run that was already complete has nothing to tell
                     self.print_line(f"finished {event.step:,} iterations in {format_duration(event.seconds)}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +29,7 @@ from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.direct import DirectStep
 from scene_experts.training.guard import check_state
 from scene_experts.training.memory import Largest
+from scene_experts.training.rate import MODEL, RateTerm
 from scene_experts.training.resident import Resident
 from scene_experts.training.run_folder import read_config
 
@@ -65,6 +67,7 @@ class Training:
         self.optimizer = cfg.optimizer.for_batch(cfg.batch).build(groups)
         scene.table.attach(self.optimizer)
         self.averages = Averages(scene) if cfg.average.span > 0 else None
+        self.rate = RateTerm(cfg.rate, cfg.seed, cfg.growth, cfg.iterations) if cfg.rate else None
 
     @classmethod
     def start(cls, cfg: Train, capture: Capture, device: str, dtype: torch.dtype = torch.float32) -> Training:
@@ -126,7 +129,9 @@ class Training:
         torch.manual_seed(cfg.seed)
         try:
             with guarding(run, RUN):
-                training = cls(cfg, restore_foreign(cfg.scene, tensors, meta, averaged=True).to(device))
+                scene = restore_foreign(cfg.scene, tensors, meta, averaged=True).to(device)
+                scene.forget_rounding()
+                training = cls(cfg, scene)
         except InputError as error:
             if other := _changes(before.train.scene, now.train.scene, "scene"):
                 raise InputError(f"expected a scene of the kind that {run} of --init-from has{other}; use the flags of that run") from error
@@ -167,8 +172,15 @@ class Training:
         """Set the learning rates of the iteration. They grow with the batch to the power
         `batch_rates`."""
         for group in self.optimizer.param_groups:
-            rate = self.cfg.rates.at(group["name"], self.step, self.cfg.iterations, self.scene.extent)
+            own = None if self.rate is None else self.rate.learning_rate(group["name"], self.step)
+            rate = self.cfg.rates.at(group["name"], self.step, self.cfg.iterations, self.scene.extent) if own is None else own
             group["lr"] = rate * self.cfg.batch**self.cfg.batch_rates
+
+    def add_groups(self, groups: Mapping[str, list[torch.nn.Parameter]]) -> None:
+        """Let the optimiser move more parameters, by the names of their learning rates."""
+        columns = self.scene.table.params
+        for name, params in groups.items():
+            self.optimizer.add_param_group({"params": params, "name": name, "lr": 0.0, "by_row": name in columns})
 
     def optimizer_step(self, rows: Tensor | None = None) -> None:
         """Run one optimiser step and remove the gradients. rows: [A] int64, the only rows of the
@@ -228,6 +240,7 @@ class Training:
             out["rng.cuda"] = torch.cuda.get_rng_state(table.device)
         if self.averages is not None:
             out |= self.averages.tensors()
+        out |= {} if self.rate is None else self.rate.tensors(self.scene)
         out["queue"] = torch.tensor(self.queue, dtype=torch.int64)
         return out
 
@@ -252,6 +265,10 @@ class Training:
         scene.table.stats = {k.removeprefix("stats."): v for k, v in tensors.items() if k.startswith("stats.")}
         training = cls(cfg, scene.to(device))
         table = training.scene.table
+        if training.rate is not None and training.scene.rounding is not None:
+            groups = training.rate.prepare(training.scene)
+            training.add_groups({MODEL: groups[MODEL]})  # the scene's own are there
+            training.rate.restore(training.scene, tensors)
         for group in training.optimizer.param_groups:
             for i, parameter in enumerate(group["params"]):
                 prefix = f"{cfg.optimizer.prefix}.{group['name']}.{i}."

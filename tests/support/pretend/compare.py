@@ -9,6 +9,7 @@ difference of a colour from the photograph. The L1 loss has a kink at 0: where a
 decides the sign of its gradient.
 RECIPE:alone: both train on their own. Then `gradients` is empty.
 RECIPE:unchanged: as RECIPE, and the training starts as it is, without the change that follows.
+RECIPE:rate: as RECIPE, with --rate from the first step on, on both.
 
 A training as it starts has equal depths (`start_changed` says why), so the parameters are changed a little before the first step.
 Densification is off: it draws random numbers on the device of the scene.
@@ -26,7 +27,7 @@ from scene_experts.data.capture import Capture
 from scene_experts.render import Rasterizer, reference
 from scene_experts.render.cpu import CpuRasterizer
 from scene_experts.render.gsplat import GsplatRasterizer
-from scene_experts.training import loop
+from scene_experts.training import loop, rate
 from scene_experts.training.config import Train
 from scene_experts.training.state import Training
 from support.pretend.setup import answer, load_small, run_of, short
@@ -106,6 +107,8 @@ def compare(capture: Capture, word: str) -> dict[str, list[float]]:
     recipe, _, how = word.partition(":")
     cfg = short(recipe)
     cfg: Train = replace(cfg, growth=replace(cfg.growth, adjust=replace(cfg.growth.adjust, interval=10**6)))
+    if how == "rate":
+        cfg, rate.first_iteration = replace(cfg, rate=0.01), lambda growth, iterations: 0
     on_cuda, on_cpu = GsplatRasterizer(antialias=cfg.antialias), Watched(antialias=cfg.antialias)
     plain = Steps(start_changed(cfg, capture, change=0.0 if how == "unchanged" else CHANGE), capture, "cpu", on_cpu)
     found: dict[str, list[float]] = {"losses": [], "gradients": [], "close": [], "errors": []}

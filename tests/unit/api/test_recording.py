@@ -9,6 +9,7 @@ from scene_experts.api import recording
 from scene_experts.core.errors import InputError
 from scene_experts.data.capture import Capture
 from scene_experts.data.settings import Data
+from scene_experts.files.anchors.sensitivity import FILE, kept
 from scene_experts.render import choose
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
@@ -39,13 +40,15 @@ def test_the_folder_is_complete_when_the_training_has_finished(tmp_path, capture
         kinds.append(type(event))
         if isinstance(event, Exported):
             assert event.path == tmp_path / "point_cloud" / "iteration_4" and event.step == 4 and not event.warnings
+            assert "compact files" in event.notes[0] and len(event.notes) == 1
             with pytest.raises(InputError, match=naming(tmp_path)), run_folder.held(tmp_path):
                 pass
     assert kinds[0] is Started and kinds[-2:] == [Exported, Finished] and {Previewed, Saved} < set(kinds)
-    for name in ("config.json", "metrics.jsonl", "previews/000002.png", "point_cloud/iteration_4/point_cloud.ply", "cameras.json"):
+    for name in ("config.json", "metrics.jsonl", "previews/000002.png", "point_cloud/iteration_4/point_cloud.ply", "cameras.json", FILE):
         assert (tmp_path / name).is_file(), name
     with run_folder.held(tmp_path):
-        assert run_folder.open_run(tmp_path).step == 4
+        run = run_folder.open_run(tmp_path)
+        assert run.step == 4 and kept(run) is not None
 
 
 def test_a_complete_run_keeps_its_layout(tmp_path, capture):

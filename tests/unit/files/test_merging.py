@@ -70,6 +70,34 @@ def test_merged_blocks_have_no_anchor_twice(trained, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_block_with_the_rate_keeps_its_masks_and_gives_up_its_steps(trained, tmp_path):
+    capture, plan = trained
+    views = ["--views", plan / "block0.json", "--init-from", plan / "coarse", "--rates.networks", 0, "--rate", 0.3, "--preview-every", 0]
+    call("train", "moe-gs", "--data", capture, "--iterations", 60, *views, "--device", "cpu", "--out", tmp_path / "rated")
+    rated = open_run(tmp_path / "rated").scene
+    assert rated.steps is not None and "class" in rated.table.facts
+    merge_blocks(plan, [tmp_path / "rated", plan / "run1"], tmp_path / "merged")
+    merged = open_run(tmp_path / "merged").scene
+    assert merged.steps is None and "class" not in merged.table.facts
+    assert merged.table.facts["slots"].shape == (len(merged.table), 10)
+    call(
+        "train",
+        "moe-gs",
+        "--data",
+        capture,
+        "--iterations",
+        64,
+        "--init-from",
+        tmp_path / "rated",
+        "--out",
+        tmp_path / "on",
+        "--device",
+        "cpu",
+    )
+    assert open_run(tmp_path / "on").scene.steps is None
+
+
+@pytest.mark.slow
 def test_runs_that_do_not_fit_are_named(trained, tmp_path):
     capture, plan = trained
     train = ["train", "moe-gs", "--data", capture, "--iterations", 50, "--preview-every", 0, "--device", "cpu"]

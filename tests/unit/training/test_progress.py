@@ -6,7 +6,7 @@ from rich.console import Console
 
 from scene_experts.scene import Traits
 from scene_experts.strategy import Edit
-from scene_experts.training.events import Densified, Finished, Previewed, Saved, Started, Stepped, Stopped
+from scene_experts.training.events import Densified, Exported, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.training.progress import ProgressBar, TrainingProgress, format_duration
 
 
@@ -17,6 +17,7 @@ def test_a_log_file_gets_plain_lines():
         show(Stepped(10, {"l1": 0.05, "dssim": 0.02}, 21.5, 1300, 800, 4000, 0.61, 1.0, {}))
         show(Densified(100, Edit(10, 0, 1310, capped=True)))
         show(Saved(200, Path("a/b")))
+        show(Exported(200, Path("a/c"), notes=("measured something (3 s)",)))
         show(Finished(200, 75.0))
         show(Stopped(100, "SIGINT"))
     text = out.getvalue()
@@ -31,6 +32,7 @@ def test_a_log_file_gets_plain_lines():
         "left",
         "cap on anchors",
         "1:15",
+        "measured something (3 s)",
     )
     for part in parts:
         assert part in text, part

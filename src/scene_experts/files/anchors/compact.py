@@ -29,6 +29,7 @@ from scene_experts.files.anchors.places import MOST_LATTICES, AnchorPlaces, Latt
 from scene_experts.files.anchors.precision import rows_of
 from scene_experts.files.anchors.quality import choose_precision
 from scene_experts.files.anchors.rounding import FURTHER, WholeScene, restore, round_scene
+from scene_experts.files.anchors.sensitivity import prepare
 from scene_experts.files.codec import container
 from scene_experts.files.codec.fit import fit_models
 from scene_experts.files.codec.groups import EXTRA, FEATURE, OFFSETS, ORDER, SCALING, SLOTS, Walk, anchor_groups
@@ -269,4 +270,5 @@ FORMAT = Format(
     read=read,
     looks_like=looks_like,
     fit=fit,
+    prepare=prepare,
 )

@@ -15,11 +15,9 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from scene_experts.files.codec.groups import HIGH_CLASS, LOW_CLASS
+from scene_experts.scene.anchors.quantise import LEAST_SHARE, ROUNDED, coarse, find_steps
 
-LEAST_SHARE = 1e-3  # of the mean sensitivity, that every channel has
 STACKED = ("w1", "b1", "w2", "b2")  # tensors whose first axis is the experts'
-ROUNDED = ("feature", "log_scaling", "offsets")
 _FINE = 64.0  # steps of a deviation, without sensitivities
 _FINE_ROWS = 128.0  # of a root mean square
 
@@ -34,17 +32,14 @@ class Precision:
     """[N] int64, from -2 to 4"""
     networks: Mapping[str, Tensor] = field(default_factory=dict)
     """By name in files: exponents [R] float32 of the rows' steps, 2^(exponent / 2)."""
+    learned: bool = False
+    """Whether a training has learned the steps and rounded the values to them (--rate)."""
 
     def at(self, theta: float) -> Precision:
-        """Steps for `theta` times the error."""
+        """Steps for `theta` times the error. Learned ones stay, and only networks change."""
         more = math.log2(theta)
-        steps = {name: coarse(value * 2.0 ** (more / 2)) for name, value in self.steps.items()}
+        steps = {name: value if self.learned else coarse(value * 2.0 ** (more / 2)) for name, value in self.steps.items()}
         return replace(self, steps=steps, networks={name: value + more for name, value in self.networks.items()})
-
-
-def coarse(values: Tensor) -> Tensor:
-    """Positive values with four digits, as the header of a file states them."""
-    return torch.tensor([float(f"{v:.4g}") for v in values.double().clamp(1e-30, 1e30).tolist()], dtype=torch.float64).float()
 
 
 def rows_of(name: str, value: Tensor) -> Tensor:
@@ -63,16 +58,7 @@ def is_exact(name: str) -> bool:
 def from_sensitivity(columns: Mapping[str, Tensor], networks: Mapping[str, Tensor]) -> Precision:
     """The steps of an error of 1 from sensitivities: columns [N, ...] by name, tensors of networks by
     name in files."""
-    steps, weighted = {}, torch.zeros(0)
-    for name in ROUNDED:
-        flat = columns[name].double().flatten(1)
-        mean = flat.mean(0) if len(flat) else torch.zeros(flat.shape[1], dtype=torch.float64)
-        mean = mean.clamp_min(max(float(mean.mean()) * LEAST_SHARE, 1e-30))
-        steps[name] = (12 / mean).sqrt().float()
-        share = (flat / mean).mean(1) / len(ROUNDED)
-        weighted = share if not len(weighted) else weighted + share
-    middle = weighted.mean().clamp_min(1e-30) if len(weighted) else torch.ones(())
-    classes = (0.5 * torch.log2(middle / weighted.clamp_min(1e-12 * float(middle)))).round().clamp(LOW_CLASS, HIGH_CLASS).long()
+    steps, classes = find_steps(columns)
     rows = {}
     for name, value in networks.items():
         if is_exact(name):

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import cast
 
 import torch
@@ -17,17 +17,20 @@ from scene_experts.core.errors import InputError
 from scene_experts.data.views import Capture, World
 from scene_experts.evaluate.metrics import psnr
 from scene_experts.files.anchors.data import AnchorData
+from scene_experts.files.anchors.precision import Precision
 from scene_experts.files.anchors.read import scene as scene_of
 from scene_experts.files.anchors.rounding import rounded
-from scene_experts.files.anchors.sensitivity import MOST_VIEWS, evenly, keep, kept, measure
+from scene_experts.files.anchors.sensitivity import keep, kept, measure
 from scene_experts.files.measure import Painter, Tell
 from scene_experts.files.options import Options
 from scene_experts.files.placed import place_cameras
 from scene_experts.files.scene_folder import origin_of
 from scene_experts.render import Rasterizer, as_trained, choose
 from scene_experts.scene import Scene
+from scene_experts.scene.anchors.quantise import CLASS
 from scene_experts.scene.anchors.scene import AnchorScene
 from scene_experts.training.run_folder import OpenRun
+from scene_experts.training.sensitivity import MOST_VIEWS, evenly
 
 VIEWS = 16  # that judge a precision
 START = -40.0  # first guess of log2 of the mean square error that every value adds
@@ -35,6 +38,7 @@ ROUNDS = 10
 UNKNOWN_ERROR = 10**-3.2  # mean square error of pictures without photographs: that of 32 dB
 WORST_ERROR = 10**-2.6  # of a scene with 26 dB: what a worse one may lose is as if it had these
 MEGABYTE = 1_000_000
+NETWORKS = 0.1  # share of the loss that networks may have where a training has rounded the other values
 
 
 @dataclass(frozen=True)
@@ -134,6 +138,13 @@ def judging_capture(run: OpenRun, world: World, capture: Capture | None) -> Iter
     yield place_cameras(run.path, trained, world, origin, run.config.data.background)
 
 
+def with_learned(precision: Precision, scene: AnchorScene) -> Precision:
+    """The precision with the steps and classes that the training of a scene learned, if it did."""
+    if scene.steps is None or CLASS not in scene.table.facts:
+        return precision
+    return replace(precision, steps=scene.steps.by_column(scene.config.F), classes=scene.table.facts[CLASS].cpu(), learned=True)
+
+
 def choose_precision(
     run: OpenRun,
     contents: AnchorData,
@@ -159,9 +170,12 @@ def choose_precision(
             draws = as_trained(rasterize or choose("auto", "cpu"), run.config.train.antialias)
             precision = measure(cast(AnchorScene, run.scene), run.step, cameras, torch.tensor(views.background), draws, tell)
             keep(run, precision)
-        unit = precision
+        unit, quality = with_learned(precision, cast(AnchorScene, run.scene)), options.quality
+        if unit.learned:
+            quality *= NETWORKS
         judge = Judge(run, world.seen_from(origin_of(run, world)), views, rasterize)
 
+        @cache
         def loss(at: float) -> float:
             return judge.loss(rounded(contents, unit.at(2.0**at)))
 
@@ -169,11 +183,15 @@ def choose_precision(
             wanted = options.target_mb * MEGABYTE
             place = search(lambda u: size(replace(contents, precision=unit.at(2.0**-u))), wanted, -START - 2, 0.12, 0.98)
             if place is None:
-                raise InputError(f"expected a --target-mb that this scene fits into, found {options.target_mb:g}; give a larger number")
+                more = ", or train with a larger --rate" if unit.learned else ""
+                raise InputError(
+                    f"expected a --target-mb that this scene fits into, found {options.target_mb:g}; give a larger number{more}"
+                )
             at = -place
         else:
-            found = search(loss, options.quality, START, 1.0, 0.85)
+            found = search(loss, quality, START, 1.0, 0.85)
             at = START - 30 if found is None else found
         lost, against = loss(at), "" if judge.has_photographs else " (estimated, without photographs)"
-        line = f"{len(judge.views)} training views lose {lost:.3f} dB{against}"
+        also = "; values have the steps that the training learned" if unit.learned else ""
+        line = f"{len(judge.views)} training views lose {lost:.3f} dB{against}{also}"
         return replace(contents, precision=unit.at(2.0**at)), [line]

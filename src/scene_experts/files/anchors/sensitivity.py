@@ -1,13 +1,8 @@
-"""How much the pictures of a trained scene depend on each of its values.
-
-The sensitivity of a value is the mean over pixels and channels of the squared derivative of the
-picture. One backward pass for each training view estimates it for all values: with a random sign
-for each pixel and channel, the square of the gradient has that sum as its mean. Only cameras are
-needed, no photographs.
-"""
+"""The precision of a run: steps by what its values do to the pictures, kept in its folder."""
 
 from __future__ import annotations
 
+import time
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,57 +14,53 @@ from torch import Tensor
 
 from scene_experts.core.checkpoint import read_tensors, write_tensors
 from scene_experts.core.errors import InputError, RunError
-from scene_experts.core.types import Camera, Mode
+from scene_experts.core.types import Camera
+from scene_experts.data.capture import Capture
 from scene_experts.files.anchors.data import FILE_NAMES
 from scene_experts.files.anchors.precision import ROUNDED, Precision, from_sensitivity, is_exact
 from scene_experts.files.measure import Tell
 from scene_experts.render import Rasterizer
 from scene_experts.scene.anchors.scene import AnchorScene
 from scene_experts.training.run_folder import OpenRun
+from scene_experts.training.sensitivity import MOST_VIEWS, evenly, find_sensitivity
 
 FILE = "precision.safetensors"
 """In a run folder: the steps of an error of 1 at the newest export."""
 KIND, VERSION = "precision", 1
-MOST_VIEWS = 48  # evenly chosen
-
-
-def evenly(items: Sequence[int], most: int) -> list[int]:
-    """At most `most` items, evenly chosen."""
-    every = max(1, -(-len(items) // most))
-    return list(items[::every])
 
 
 def measure(scene: AnchorScene, step: int, cameras: Sequence[Camera], background: Tensor, rasterize: Rasterizer, tell: Tell) -> Precision:
-    """The steps of an error of 1 of a scene on the CPU, from its pictures at `cameras` over
-    `background` [3]."""
+    """The steps of an error of 1 of a scene, from its pictures at `cameras` over `background`
+    [3]."""
     named = {f"params.{name}": scene.table.params[name] for name in ROUNDED}
     for name, value in scene.network_tensors().items():
         part, _, rest = name.partition(".")
         named[f"{'feature_bank' if part == 'mix' else part}.{FILE_NAMES.get(rest, rest)}"] = value
     values = {name: value for name, value in named.items() if not is_exact(name)}
-    before = [value.requires_grad for value in values.values()]
-    totals = {name: torch.zeros_like(value) for name, value in values.items()}
-    generator, pixels = torch.Generator().manual_seed(0), 0
-    try:
-        for value in values.values():
-            value.requires_grad_(True)
-        for i, camera in enumerate(cameras):
-            decoded = scene(camera, step, Mode.DRAW, rasterize.visible)
-            image = rasterize(decoded.gaussians, camera, background).image
-            signs = torch.randint(0, 2, image.shape, generator=generator).to(image.dtype) * 2 - 1
-            if image.requires_grad:
-                found = torch.autograd.grad((image * signs).sum(), list(values.values()), allow_unused=True)
-                for total, gradient in zip(totals.values(), found):
-                    if gradient is not None:
-                        total += gradient.square()
-            pixels += image.numel()
-            tell("measuring what each value does to the pictures", i + 1, len(cameras))
-    finally:
-        for value, wanted in zip(values.values(), before):
-            value.requires_grad_(wanted)
-    means = {name: (total / max(pixels, 1)).nan_to_num(0, 0, 0) for name, total in totals.items()}
+
+    def tell_views(done: int, total: int) -> None:
+        tell("measuring what each value does to the pictures", done, total)
+
+    found = find_sensitivity(scene, values, step, cameras, background, rasterize, tell_views)
+    means = {name: value.cpu() for name, value in found.items()}
     columns = {name: means.pop(f"params.{name}") for name in ROUNDED}
     return from_sensitivity(columns, means)
+
+
+def prepare(run: OpenRun, capture: Capture, rasterize: Rasterizer, device: str) -> str:
+    """Measure the precision of a run on a device and keep it in the run folder. Returns a sentence
+    about it. See `registry.Format.prepare`."""
+    scene, begun = cast(AnchorScene, run.scene), time.process_time()
+    if not len(scene.table) or not capture.train:
+        return ""
+    cameras = [capture.views[i].camera.to(device) for i in evenly(capture.train, MOST_VIEWS)]
+    scene.to(device)
+    try:
+        precision = measure(scene, run.step, cameras, torch.tensor(capture.background, device=device), rasterize, lambda *_: None)
+    finally:
+        scene.to("cpu")
+    keep(run, precision)
+    return f"measured what each value does to the pictures, for exports as compact files ({time.process_time() - begun:.0f} s of CPU time)"
 
 
 def fingerprint(scene: AnchorScene) -> int:

@@ -146,7 +146,7 @@ def describe(run: OpenRun, world: World) -> dict[str, Any]:
         "world": {"scale": world.scale, "shift": list(world.shift)},
         "feature_bank": scene.bank is not None,
         "extent": scene.extent,
-        "scene": scene.meta(),
+        "scene": {name: value for name, value in scene.meta().items() if name != "steps"},  # files say them in their own way
     }
 
 

@@ -9,35 +9,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from scene_experts.core.logistic import find_slopes
+from scene_experts.core.threads import one_thread
 from scene_experts.files.codec.groups import CLASS, MOST_FACTOR, MOST_OFFSET, SLOTS, UNIT, ChannelGroup, GroupModel, Walk, inputs_of
 from scene_experts.files.codec.order import CodingOrder
 from scene_experts.files.codec.reference import Ints
 from scene_experts.files.codec.streams import as_inputs
 
 ROWS = 32_768  # anchors that a model is fitted to, at most
-STEPS, BATCH, RATE = 300, 2048, 0.02
+STEPS, BATCH, RATE = 240, 2048, 0.02
 PER_STEP = 4  # anchors for each step, at least: few anchors cannot tell more
 PRICE = 8.0  # bits, of each unit of the size of a weight (in deviations); spread over the anchors
 _MEAN, _SPREAD = 64.0, 6  # units of a weight of the mean; shift of those of the spread
 _OCTAVE = 8 / math.log(2)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Sums in torch in one order, whatever the number of threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def fit_models(groups: Sequence[ChannelGroup], order: CodingOrder, values: Mapping[str, Ints]) -> dict[str, GroupModel]:
@@ -118,21 +108,18 @@ def _fit(
         return _whole(blank, torch.zeros_like(spread), torch.zeros(C), spread, bias, mask, binary=True)
     base = y * 2.0**k
     deviation, middle = base.std(0, correction=0) + 1e-2, base.mean(0)
-    mean = torch.zeros(C, X.shape[1])
-    bias = torch.zeros(C)
-    for c in range(C):
-        used = blank.weights[c].shape[1]
-        w = seen[:, c : c + 1] * 2.0**-k
-        A = torch.cat([X[:, :used], torch.ones(n, 1)], 1).double() * w
-        target = ((base[:, c : c + 1] - middle[c]) / deviation[c]).double() * w
-        ridge = 1e-3 * n * torch.eye(used + 1, dtype=torch.float64)
-        found = torch.linalg.solve(A.T @ A + ridge, A.T @ target)[:, 0].float()
-        mean[c, :used], bias[c] = found[:-1], found[-1]
-    if not group.from_parents and not group.is_chain:
-        mean, bias = torch.zeros_like(mean), torch.zeros_like(bias)
+    mean, bias, means = torch.zeros(C, X.shape[1]), torch.zeros(C), group.from_parents or group.is_chain
+    if means:
+        A = torch.cat([torch.ones(n, 1), X], 1).double() * 2.0**-k  # inputs of a channel are the first ones
+        square, right = A.T @ A, A.T @ (((base - middle) / deviation).double() * 2.0**-k)
+        for c in range(C):
+            used = blank.weights[c].shape[1] + 1
+            ridge = 1e-3 * n * torch.eye(used, dtype=torch.float64)
+            found = torch.linalg.solve(square[:used, :used] + ridge, right[:used, c : c + 1])[:, 0].float()
+            mean[c, : used - 1], bias[c] = found[1:], found[0]
     left = ((base - middle) / deviation - X @ mean.T - bias).abs()
     start = torch.log(0.7 * (left * seen).sum(0) / seen.sum(0).clamp_min(1) + 1e-3)
-    mean, bias, spread, start = _descend(X, y, k, seen, mask, mean, bias, start, middle, deviation, group.from_parents or group.is_chain)
+    mean, bias, spread, start = _descend(X, y, k, seen, mask, mean, bias, start, middle, deviation, means)
     return _whole(blank, mean * deviation[:, None], bias * deviation + middle, spread, start + deviation.log(), mask)
 
 
@@ -151,49 +138,62 @@ def _descend(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Weights and biases of mean and spread (in deviations and natural logarithms) with the
     shortest code."""
-    n = len(y)
-    spread = torch.zeros_like(mean)
-    parts = [mean, bias, spread, start] if means else [spread, start]
-    for part in parts:
-        part.requires_grad_()
-    optimizer = torch.optim.Adam(parts, lr=RATE)
-    generator = torch.Generator().manual_seed(0)
-    steps = min(STEPS, n // PER_STEP)
-    for step in range(steps):
-        rows = torch.randint(0, n, (min(BATCH, n),), generator=generator)
-        for entry in optimizer.param_groups:
-            entry["lr"] = RATE * 0.03 ** (step / steps)
-        x, own = X[rows], k[rows]
-        m = (middle + deviation * (bias + x @ (mean * mask).T)) * 2.0**-own
-        log_scale = start + x @ (spread * mask).T + deviation.log() - own * math.log(2)
-        away, s = -(y[rows] - m).abs(), torch.exp(-log_scale)
-        share = torch.sigmoid((away + 0.5) * s) - torch.sigmoid((away - 0.5) * s)
-        bits = -torch.log2(share * (1 - 2e-4) + 1e-5) * seen[rows]
-        price = PRICE / n * (mean.abs().sum() + spread.abs().sum())
-        optimizer.zero_grad()
-        (bits.sum(1).mean() + price).backward()
-        optimizer.step()
-    return mean.detach(), bias.detach(), spread.detach(), start.detach()
+    n, spread = len(y), torch.zeros_like(mean)
+    adam = _Descent([mean, bias, spread, start], min(STEPS, n // PER_STEP))
+    price, log_deviation = PRICE / n, deviation.log()
+    for rows in adam.rows(n):
+        x, own, weight = X[rows], k[rows], seen[rows] / min(BATCH, n)
+        factor = 2.0**-own
+        m = (middle + deviation * (bias + x @ mean.T)) * factor
+        log_scale = start + x @ spread.T + log_deviation - own * math.log(2)
+        _, by_away, by_spread = find_slopes(y[rows] - m, log_scale)
+        by_mean, by_spread = by_away.mul_(weight).mul_(-deviation * factor), by_spread.mul_(weight)
+        moved = means * mask
+        adam.move(
+            [
+                (by_mean.T @ x).mul_(moved).add_(mean.sign(), alpha=price),
+                means * by_mean.sum(0),
+                (by_spread.T @ x).mul_(mask).add_(spread.sign(), alpha=price),
+                by_spread.sum(0),
+            ]
+        )
+    return mean, bias, spread, start
+
+
+class _Descent:
+    """Adam (Kingma and Ba 2015) on a few tensors, in place, with random rows for each step."""
+
+    def __init__(self, tensors: list[Tensor], count: int) -> None:
+        self.tensors, self.count, self.step = tensors, count, 0
+        self.moments = [(torch.zeros_like(t), torch.zeros_like(t)) for t in tensors]
+        self.generator = torch.Generator().manual_seed(0)
+
+    def rows(self, n: int) -> Iterator[Tensor]:
+        """Random rows of n for each step."""
+        for _ in range(self.count):
+            yield torch.randint(0, n, (min(BATCH, n),), generator=self.generator)
+
+    def move(self, gradients: list[Tensor]) -> None:
+        """Take a step. The rate falls log-linearly."""
+        rate, self.step = RATE * 0.03 ** (self.step / self.count), self.step + 1
+        for tensor, gradient, (first, second) in zip(self.tensors, gradients, self.moments):
+            first.lerp_(gradient, 0.1)
+            second.mul_(0.999).addcmul_(gradient, gradient, value=0.001)
+            size = (second.sqrt() / math.sqrt(1 - 0.999**self.step)).add_(1e-8)
+            tensor.addcdiv_(first, size, value=-rate / (1 - 0.9**self.step))
 
 
 def _descend_binary(X: Tensor, y: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     """Weights and biases of the natural logarithm of the odds."""
-    weights = torch.zeros_like(mask).requires_grad_()
+    n, weights = len(y), torch.zeros_like(mask)
     share = y.mean(0).clamp(0.01, 0.99)
-    bias = torch.log(share / (1 - share)).requires_grad_()
-    optimizer = torch.optim.Adam([weights, bias], lr=RATE)
-    generator = torch.Generator().manual_seed(0)
-    steps = min(STEPS, len(y) // PER_STEP)
-    for step in range(steps):
-        rows = torch.randint(0, len(y), (min(BATCH, len(y)),), generator=generator)
-        for entry in optimizer.param_groups:
-            entry["lr"] = RATE * 0.03 ** (step / steps)
-        odds = X[rows] @ (weights * mask).T + bias
-        loss = torch.nn.functional.binary_cross_entropy_with_logits(odds, y[rows], reduction="none").sum(1).mean() / math.log(2)
-        optimizer.zero_grad()
-        (loss + PRICE / len(y) * weights.abs().sum()).backward()
-        optimizer.step()
-    return weights.detach(), bias.detach()
+    bias = torch.log(share / (1 - share))
+    adam = _Descent([weights, bias], min(STEPS, n // PER_STEP))
+    for rows in adam.rows(n):
+        x = X[rows]
+        slope = ((x @ weights.T + bias).sigmoid_() - y[rows]) / (min(BATCH, n) * math.log(2))
+        adam.move([(slope.T @ x).mul_(mask).add_(weights.sign(), alpha=PRICE / n), slope.sum(0)])
+    return weights, bias
 
 
 def _whole(blank: GroupModel, mean: Tensor, mean_bias: Tensor, spread: Tensor, spread_bias: Tensor, mask: Tensor, binary: bool = False) -> GroupModel:  # fmt: skip  # noqa: E501

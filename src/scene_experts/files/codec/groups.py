@@ -18,9 +18,8 @@ from scene_experts.core.reading.budget import Damaged
 from scene_experts.files.codec.order import LEVELS, CodingOrder
 from scene_experts.files.codec.reference import Ints
 from scene_experts.files.codec.streams import MOST_INPUTS, SymbolReader, SymbolWriter, as_inputs, blend, predict
+from scene_experts.scene.anchors.quantise import HIGH_CLASS, LOW_CLASS
 
-LOW_CLASS, HIGH_CLASS = -2, 4
-"""Least and largest step class: an anchor's steps are 2^class times those of the channels."""
 CLASSES = HIGH_CLASS - LOW_CLASS + 1
 UNIT = 32  # an input of 32 is one standard deviation, or "yes"
 MOST_FACTOR, MOST_OFFSET, MOST_BIAS, MOST_SHIFT = 1 << 20, 1 << 28, 1 << 28, 24

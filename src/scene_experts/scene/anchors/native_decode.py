@@ -22,6 +22,7 @@ from scene_experts.native import api
 from scene_experts.native import library as native
 from scene_experts.native.api import SeDecode
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, NOT_ROUTED, HeadWeights, Outside
+from scene_experts.scene.anchors.quantise import RowRounding
 
 WHAT = "the decode"
 TENSORS = api.HEAD_TENSORS
@@ -42,6 +43,9 @@ class Plan:
     ascending: bool
     outside: tuple[bool, bool, bool] = (False, False, False)  # whether the mixture weights are given
     chosen: tuple[Tensor | None, ...] = (None, None, None)  # [A, k] int64, the experts of heads that are routed outside
+    factors: Tensor | None = None  # [N], of the steps; None: values are not rounded
+    slots: Tensor | None = None  # [N, K] bool: those that are drawn; None: all
+    origin: float = 0.0  # where the multiples of log-scalings begin
 
 
 def decode(
@@ -55,11 +59,12 @@ def decode(
     with_dist: dict[str, bool],
     extent: float = 1.0,
     outside: Outside = NOT_ROUTED,
+    rounding: RowRounding | None = None,
 ) -> tuple[Gaussians, Tensor, dict[str, Routing]]:
     """Decode anchors into Gaussians.
 
-    Differentiable with respect to feature, log_scaling, offsets, the tensors of the heads and the
-    weights in `outside`, but not xyz and the camera. All tensors are float32 on the CPU unless
+    Differentiable with respect to feature, log_scaling, offsets, the tensors of the heads, the
+    weights in `outside` and the steps, but not xyz and the camera. All tensors are float32 on the CPU unless
     noted.
 
     Args:
@@ -74,6 +79,8 @@ def decode(
         extent: Routers that receive positions receive xyz / extent.
         outside: Routing and mixture weights ([A, k], or [A, E] while dense) of the heads that are
             `HeadWeights.routed_outside`.
+        rounding: How the values of all rows are rounded, and which slots are drawn; None: values
+            are drawn as they are. `RowRounding.mark` gives the masks their gradients.
 
     Returns:
         The Gaussians of positive opacity, ordered by (row, slot); the raw opacities [A, K]; the
@@ -98,9 +105,13 @@ def decode(
     plan = replace(
         plan, outside=tuple(a in outside for a in ATTRIBUTES), chosen=tuple(None if c is None else c.contiguous() for c in chosen)
     )
+    log_steps = None
+    if rounding is not None:
+        log_steps = rounding.log_steps
+        plan = replace(plan, factors=rounding.factors.contiguous(), slots=rounding.open.contiguous(), origin=rounding.origins[1])
     weights = [getattr(h, name) for h in found for name in TENSORS]
     mixed = [outside[a][1] if a in outside else None for a in ATTRIBUTES]
-    out = _DecodeFunction.apply(plan, feature, log_scaling, offsets, *weights, *mixed)
+    out = _DecodeFunction.apply(plan, feature, log_scaling, offsets, *weights, *mixed, log_steps)
     means, quats, scales, opacities, colors, source, raw = out[:7]
     found_routing = {a: Routing(gates, picked) for a, gates, picked in zip(ATTRIBUTES, out[7:10], out[10:13]) if gates is not None}
     routing = {a: outside[a][0] if a in outside else found_routing[a] for a in ATTRIBUTES if a in outside or a in found_routing}
@@ -185,9 +196,9 @@ class _DecodeFunction(torch.autograd.Function):
     def forward(ctx: Any, plan: Plan, feature: Tensor, log_scaling: Tensor, offsets: Tensor, *weights: Tensor | None) -> tuple:
         columns = [t.detach().contiguous() for t in (feature, log_scaling, offsets)]
         weights = tuple(None if t is None else t.detach().contiguous() for t in weights)
-        weights, given = weights[: 3 * T], weights[3 * T :]
-        A = len(plan.rows)
-        call = make_call(plan, columns, weights)
+        weights, given, log_steps = weights[: 3 * T], weights[3 * T : -1], weights[-1]
+        A, steps = len(plan.rows), None if log_steps is None else log_steps.exp()
+        call = make_call(plan, columns, weights, steps)
         gates, chosen, chosen_weight = [], [], []
         for i, k in enumerate(plan.k):
             routed, E = weights[T * i] is not None, call.heads[i].E
@@ -199,7 +210,7 @@ class _DecodeFunction(torch.autograd.Function):
         made = (means, quats, scales, opacities, colors)
         ctx.plan = plan
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*columns, *weights, raw, starts, *made, per_length, *gates, *chosen, *chosen_weight)
+        ctx.save_for_backward(*columns, *weights, raw, starts, *made, per_length, *gates, *chosen, *chosen_weight, steps)
         shown = [[None if out else t for out, t in zip(plan.outside, found)] for found in (gates, chosen)]
         ctx.mark_non_differentiable(source, *(c for c in shown[1] if c is not None))
         return means, quats, scales, opacities, colors, source, raw, *shown[0], *shown[1]
@@ -208,9 +219,10 @@ class _DecodeFunction(torch.autograd.Function):
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple:
         plan: Plan = ctx.plan
         saved = ctx.saved_tensors
-        columns, weights, made, routing = saved[:3], saved[3 : 3 + 3 * T], saved[3 + 3 * T : 11 + 3 * T], saved[11 + 3 * T :]
+        columns, weights, made, routing = saved[:3], saved[3 : 3 + 3 * T], saved[3 + 3 * T : 11 + 3 * T], saved[11 + 3 * T : -1]
+        steps = saved[-1]
         raw, starts, means, quats, scales, opacities, colors, per_length = made
-        call = make_call(plan, columns, weights)
+        call = make_call(plan, columns, weights, steps)
         set_pointers(
             call, raw=raw, starts=starts, means=means, quats=quats, scales=scales, opacities=opacities, colors=colors, per_length=per_length
         )
@@ -221,7 +233,8 @@ class _DecodeFunction(torch.autograd.Function):
         # that are not decoded.
         fresh = torch.empty_like if plan.ascending else torch.zeros_like
         d_columns, d_weights = [fresh(t) for t in columns], [None if t is None else torch.empty_like(t) for t in weights]
-        set_pointers(call, d_feature=d_columns[0], d_log_scaling=d_columns[1], d_offsets=d_columns[2])
+        d_log_steps = None if steps is None else torch.empty_like(steps)
+        set_pointers(call, d_feature=d_columns[0], d_log_scaling=d_columns[1], d_offsets=d_columns[2], d_log_steps=d_log_steps)
         for i, head in enumerate(call.heads):
             set_pointers(head, d_gates=given[7 + i], **{f"d_{name}": d_weights[T * i + j] for j, name in enumerate(TENSORS)})
         mixed = [raw.new_empty(len(raw), h.k or h.E) if out else None for out, h in zip(plan.outside, call.heads)]
@@ -229,17 +242,19 @@ class _DecodeFunction(torch.autograd.Function):
             set_pointers(head, d_weight=d_weight)
         native.check(native.require().se_decode_backward(ctypes.byref(call)), "the backward pass of the decode")
         wanted = ctx.needs_input_grad[1:]
-        return None, *(g if want else None for g, want in zip([*d_columns, *d_weights, *mixed], wanted))
+        return None, *(g if want else None for g, want in zip([*d_columns, *d_weights, *mixed, d_log_steps], wanted))
 
 
-def make_call(plan: Plan, columns: Any, weights: Any) -> SeDecode:
-    """Return the structure with all inputs. The tensors must outlive the call."""
+def make_call(plan: Plan, columns: Any, weights: Any, steps: Tensor | None = None) -> SeDecode:
+    """Return the structure with all inputs. The tensors must outlive the call. steps: [F + 6 + 3 K],
+    with `plan.factors`."""
     feature, log_scaling, offsets = columns
     call = SeDecode(
         A=len(plan.rows), N=len(plan.xyz), K=offsets.shape[1], F=feature.shape[1], threads=native.count_threads(), ascending=plan.ascending
     )
-    call.extent = plan.extent
+    call.extent, call.origin = plan.extent, plan.origin
     set_pointers(call, rows=plan.rows, xyz=plan.xyz, feature=feature, log_scaling=log_scaling, offsets=offsets, camera=plan.camera)
+    set_pointers(call, steps=steps, factors=None if steps is None else plan.factors, slots=plan.slots)
     for i, head in enumerate(call.heads):
         own = dict(zip(TENSORS, weights[T * i : T * i + T]))
         set_pointers(head, **own)

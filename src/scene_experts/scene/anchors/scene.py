@@ -14,7 +14,8 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal, Self
+from types import SimpleNamespace
+from typing import Annotated, Any, Literal, Self, cast
 
 import torch
 from torch import Tensor, nn
@@ -37,6 +38,7 @@ from scene_experts.scene.anchors.features import FeatureMix, OwnFeature
 from scene_experts.scene.anchors.few_views import displace, find_spacings, find_weight, left_at
 from scene_experts.scene.anchors.frozen import Frozen, FrozenCuda
 from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, Attribute, Decoder, Head, HeadWeights, Plain
+from scene_experts.scene.anchors.quantise import CLASS, KEEP, OPEN, ROUNDED, STEPS, RowRounding, Steps, settle
 from scene_experts.scene.anchors.select import AllAnchors, Selection, Selector, drop_masked, fade_opacities, visible_rows
 from scene_experts.scene.anchors.smoothing import find_intervals, smooth
 from scene_experts.scene.anchors.triton_networks import covers
@@ -105,6 +107,10 @@ class Anchors(SceneConfig):
         return self.decoder.dense_until
 
     @property
+    def can_round(self) -> bool:
+        return True
+
+    @property
     def has(self) -> frozenset[str]:
         return self.decoder.has | {OPACITY}
 
@@ -130,7 +136,9 @@ class Anchors(SceneConfig):
 
     def load(self, table: Table, meta: dict[str, Any]) -> AnchorScene:
         """Create the scene of a checkpoint with newly initialized networks."""
-        return AnchorScene(self, table, float(meta["voxel"]), float(meta["extent"]), self.select.restore(meta), meta.get("views", ()))
+        scene = AnchorScene(self, table, float(meta["voxel"]), float(meta["extent"]), self.select.restore(meta), meta.get("views", ()))
+        scene.steps = Steps.from_plain(meta["steps"], self.F, self.K) if "steps" in meta else None
+        return scene
 
     def check(self, flag: Flag) -> None:
         self.mix.check_size(self.F)
@@ -140,12 +148,15 @@ class AnchorScene(LatticeScene):
     """N anchors with three decoder heads.
 
     Columns: cell [N, 3] int64, xyz [N, 3]; feature [N, F], offsets [N, K, 3], log_scaling [N, 6].
+    While a training rounds the values (`start_rounding`): keep [N, K], class [N] int64.
     """
 
     config: Anchors
     bank: Any  # the feature bank; None without one
     voxel: float
     codes: Codes | None
+    steps: Steps | None
+    """Of what a compact file holds; None: no training has learned them."""
 
     def __init__(
         self, config: Anchors, table: Table, voxel: float, extent: float, select: Selector | None = None, views: Sequence[int] = ()
@@ -154,7 +165,7 @@ class AnchorScene(LatticeScene):
         units. views: the training cameras' ids."""
         super().__init__(table, extent)
         self.config, self.voxel, self.dense_until = config, voxel, config.dense_until
-        self.select = select or AllAnchors()
+        self.select, self.steps = select or AllAnchors(), None
         heads: dict[str, nn.Module] = {}
         for attribute in ATTRIBUTES:
             inputs = config.mix.width(config.F) + 3 + (attribute in config.add_dist) + (config.appearance if attribute == "color" else 0)
@@ -194,7 +205,8 @@ class AnchorScene(LatticeScene):
 
     def meta(self) -> dict[str, Any]:
         views = {"views": list(self.codes.views)} if self.codes else {}
-        return {"voxel": self.voxel, "extent": self.extent, **self.select.meta(), **views}
+        steps = {"steps": self.steps.plain()} if self.steps is not None else {}
+        return {"voxel": self.voxel, "extent": self.extent, **self.select.meta(), **views, **steps}
 
     @classmethod
     def from_points(cls, config: Anchors, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> AnchorScene:
@@ -241,7 +253,11 @@ class AnchorScene(LatticeScene):
             facts = {**facts, "interval": find_intervals(facts["xyz"].to(feature.dtype), self.cameras)}
         if "slots" in self.table.facts:
             facts = {**facts, "slots": torch.ones(n, self.K, dtype=torch.bool, device=cells.device)}
+        if CLASS in self.table.facts:
+            facts = {**facts, CLASS: torch.zeros_like(cells[:, 0])}
+        masks = {KEEP: feature.new_full((n, self.K), OPEN)} if KEEP in self.table.params else {}
         return {
+            **masks,
             **{name: value.to(feature.dtype) if value.is_floating_point() else value for name, value in facts.items()},
             "feature": feature,
             "offsets": feature.new_zeros(n, self.K, 3),
@@ -288,6 +304,8 @@ class AnchorScene(LatticeScene):
         weights = {a: self.heads[a].weights(step) for a in ATTRIBUTES}
         if why := self.why_composed(weights) or ("--scene.decode composed" if self.config.decode == "composed" else ""):
             return why
+        if self.rounding is not None:
+            return "values that are rounded"
         if not all(head.in_two_phases for head in self.heads.values()):
             return "a decoder with phases of its own"
         return explain_uncovered(weights) or DirectAnchors(self, weights, load)
@@ -314,13 +332,49 @@ class AnchorScene(LatticeScene):
             return self.decode_composed(rows, camera, step, mode)
         if self.codes is not None:
             weights["color"] = fold(weights["color"], self.codes(camera, mode))
-        p = self.table.params
         with_dist = {a: a in self.config.add_dist for a in ATTRIBUTES}
-        xyz, columns = self.table.facts["xyz"], (p["feature"], p["log_scaling"], p["offsets"])
+        xyz, columns, rounding = self.table.facts["xyz"], self.columns(), self.rounding
         outside = self.route_outside(weights, rows, step, mode)
-        fused = native_decode if rows.device.type == "cpu" else triton_decode
-        made = fused.decode(rows, xyz, *columns, camera.position, weights, with_dist, self.extent, outside)
-        return Decoded(made[0], rows, made[1], made[2])
+        if rows.device.type == "cpu":
+            made = native_decode.decode(rows, xyz, *columns, camera.position, weights, with_dist, self.extent, outside, rounding)
+        else:
+            columns = columns if rounding is None else rounding.round(columns)
+            made = triton_decode.decode(rows, xyz, *columns, camera.position, weights, with_dist, self.extent, outside)
+        decoded = Decoded(made[0], rows, made[1], made[2])
+        return decoded if rounding is None else rounding.mark(decoded)
+
+    def columns(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return feature [N, F], log_scaling [N, 6] and offsets [N, K, 3] as they are learned."""
+        p = self.table.params
+        return p["feature"], p["log_scaling"], p["offsets"]
+
+    @property
+    def rounding(self) -> RowRounding | None:
+        """How values are rounded before they are drawn; None: they are drawn as they are."""
+        if self.steps is None or KEEP not in self.table.params:
+            return None
+        return RowRounding(self.steps.log_steps, self.table.facts[CLASS], self.table.params[KEEP], self.steps.scale)
+
+    def start_rounding(self, steps: Tensor, classes: Tensor, scale: float = 1.0) -> None:
+        """Draw values from now on as a compact file would hold them, with masks that are all open.
+        steps: [F + 6 + 3 K]; classes: [N] int64; scale: of the world, `data.views.World`."""
+        table = self.table
+        self.steps = Steps(steps, scale).to(table.device)
+        table.params[KEEP] = nn.Parameter(table.params["offsets"].new_full((len(table), self.K), OPEN))
+        table.facts[CLASS] = classes.to(table.device)
+        if table.averages:
+            table.averages[KEEP] = table.params[KEEP].detach().clone()
+
+    def forget_rounding(self) -> None:
+        self.steps = None
+        self.table.facts.pop(CLASS, None)
+
+    @torch.no_grad()
+    def settled(self) -> AnchorScene:
+        rounding = self.rounding
+        if rounding is None or self.steps is None:
+            return self
+        return self.with_table(settle(self.table, rounding, self.steps.by_column(self.config.F)))
 
     def route_outside(
         self, weights: dict[str, HeadWeights], rows: Tensor, step: int, mode: Mode = Mode.DRAW
@@ -330,7 +384,7 @@ class AnchorScene(LatticeScene):
         heads = {a: self.heads[a] for a, w in weights.items() if w.routed_outside}
         if not heads:
             return {}
-        feature, position = self.table.params["feature"].index_select(0, rows), self.table.facts["xyz"].index_select(0, rows) / self.extent
+        feature, position = self.drawn(rows)[0], self.table.facts["xyz"].index_select(0, rows) / self.extent
         return {a: head.route(feature, step, position, mode) for a, head in heads.items()}  # type: ignore[misc]
 
     def fused_weights(self, step: int) -> dict[str, HeadWeights] | None:
@@ -372,19 +426,27 @@ class AnchorScene(LatticeScene):
         kernels = "compiled" if self.table.device.type == "cpu" else "Triton"
         return f"fused ({kernels})" + (f", routed in torch ({', '.join(outside)}: a router without a kernel)" if outside else "")
 
-    def inputs(self, rows: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-        """Return features [A, F], unit directions from camera to anchor [A, 3] and distances [A,
+    def drawn(self, rows: Tensor) -> tuple[Tensor, ...]:
+        """Return `columns` of rows [A] as they are drawn."""
+        rounding = self.rounding
+        return tuple(c.index_select(0, rows) for c in self.columns()) if rounding is None else rounding.round(self.columns(), rows)
+
+    def inputs(self, rows: Tensor, camera: Camera, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return features [A, F] of `features` [N, F], unit directions from camera to anchor [A, 3] and distances [A,
         1]."""
         v = self.table.facts["xyz"].index_select(0, rows) - camera.position.to(self.table.facts["xyz"])
         distance = v.norm(dim=1, keepdim=True)
-        return self.table.params["feature"].index_select(0, rows), v / distance.clamp_min(EPS), distance
+        return features.index_select(0, rows), v / distance.clamp_min(EPS), distance
 
     def decode_composed(self, rows: Tensor, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Decoded:
         """Reference decode in PyTorch: call one head per attribute, then mask, activate and place
         the Gaussians."""
-        p, K = self.table.params, self.K
-        feature, direction, distance = self.inputs(rows, camera)
-        seen = feature if self.bank is None else self.bank(self.table, rows, direction, distance)
+        p, K, rounding, table = self.table.params, self.K, self.rounding, self.table
+        if rounding is not None:
+            p = dict(zip(ROUNDED, rounding.round(self.columns())))
+            table = cast(Table, SimpleNamespace(params=p, facts=table.facts))
+        feature, direction, distance = self.inputs(rows, camera, p["feature"])
+        seen = feature if self.bank is None else self.bank(table, rows, direction, distance)
         position = self.table.facts["xyz"].index_select(0, rows) / self.extent
         out: dict[str, Tensor] = {}
         routing: dict[str, Routing] = {}
@@ -412,13 +474,15 @@ class AnchorScene(LatticeScene):
             colors=out["color"].reshape(-1, 3).index_select(0, keep),
             source=source,
         )
-        return Decoded(gaussians, rows, raw, routing)
+        decoded = Decoded(gaussians, rows, raw, routing)
+        return decoded if rounding is None else rounding.mark(decoded)
 
     def routing(self, step: int, most: int | None = None, mode: Mode = Mode.DRAW) -> dict[str, Routing]:
         """Return the routing by attribute for all anchors, or for at most `most` evenly spaced
         ones. It is independent of the camera."""
         every = max(1, -(-len(self.table) // most)) if most else 1
-        feature, position = self.table.params["feature"][::every], self.table.facts["xyz"][::every] / self.extent
+        rows = torch.arange(0, len(self.table), every, device=self.table.device)
+        feature, position = self.drawn(rows)[0], self.table.facts["xyz"][::every] / self.extent
         found = {a: self.heads[a].route(feature, step, position, mode) for a in ATTRIBUTES}
         return {a: r[0] for a, r in found.items() if r is not None}
 
@@ -445,7 +509,7 @@ class AnchorScene(LatticeScene):
     def frozen(self, step: int) -> Draws:
         """Return the scene with precomputed routing if the native decode supports it, otherwise the
         scene itself."""
-        weights = self.fused_weights(step) if len(self.table) else None
+        weights = self.fused_weights(step) if len(self.table) and self.rounding is None else None
         if weights is None:
             return self
         return (Frozen if self.table.device.type == "cpu" else FrozenCuda)(self, weights, step)
@@ -453,6 +517,8 @@ class AnchorScene(LatticeScene):
     def rate_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return the parameters by learning rate name: one group per column, head and router."""
         groups = {name: [self.table.params[name]] for name in ("feature", "offsets", "log_scaling")}
+        if self.steps is not None and self.rounding is not None:
+            groups |= {KEEP: [self.table.params[KEEP]], STEPS: [self.steps.log_steps]}
         for attribute in ATTRIBUTES:
             head = self.heads[attribute]
             groups[attribute] = head.network_parameters()

@@ -1,6 +1,7 @@
 """The search for a precision, and files of a wanted loss or size."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,7 +11,9 @@ from scene_experts.core.plain import to_json
 from scene_experts.data.views import World
 from scene_experts.files import placed
 from scene_experts.files.anchors import compact, quality
-from scene_experts.files.anchors.quality import search
+from scene_experts.files.anchors.precision import from_spread
+from scene_experts.files.anchors.quality import search, with_learned
+from scene_experts.files.anchors.rounding import rounded
 from scene_experts.files.anchors.write import contents, describe
 from scene_experts.files.codec import fit
 from scene_experts.files.export import export
@@ -61,3 +64,26 @@ def test_a_file_without_photographs_gets_a_wanted_loss_or_size(tmp_path, monkeyp
     assert written.bytes <= wanted * 1e6 and written.bytes > 0.9 * wanted * 1e6
     with pytest.raises(InputError, match="--target-mb"):
         export(opened, "compact", tmp_path / "c.compact", Options(measure=False, target_mb=0.0001))
+
+
+def test_a_file_of_a_trained_rate_loses_nothing_at_rounding():
+    run = run_in_memory("scene-experts")
+    g, scene = torch.Generator().manual_seed(0), run.scene
+    with torch.no_grad():
+        for value in scene.table.params.values():
+            value += 0.3 * torch.randn(value.shape, generator=g)
+    scene.start_rounding(0.01 + 0.1 * torch.rand(68, generator=g), torch.randint(-2, 5, (len(scene.table),), generator=g), 0.3)
+    scene.table.params["keep"].data.normal_(generator=g)
+    run, world = replace(run, scene=scene.settled()), World(0.3, (1.0, 2.0, 3.0))
+    data = contents(run, world, describe(run, world))
+    assert "steps" not in describe(run, world)["scene"]
+    spread = from_spread(data.columns, data.networks)
+    assert not with_learned(spread, run_in_memory("scene-experts").scene).learned
+    precision = with_learned(spread, run.scene)
+    assert precision.learned and precision.at(4.0).steps == precision.steps
+    assert torch.equal(precision.at(4.0).networks["cov.experts.w1"], spread.networks["cov.experts.w1"] + 2)
+    found = rounded(data, precision).columns
+    slots = data.columns["slots"]
+    assert torch.equal(found["feature"], data.columns["feature"]) and torch.equal(found["slots"], slots)
+    assert torch.equal(found["offsets"], data.columns["offsets"] * slots[..., None])
+    torch.testing.assert_close(found["log_scaling"], data.columns["log_scaling"], rtol=0, atol=1e-6)

@@ -1,13 +1,14 @@
 """Sensitivities against the squared derivatives of a picture, one pixel at a time."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from scene_experts.core.types import Mode
 from scene_experts.files.anchors import sensitivity
-from scene_experts.files.anchors.sensitivity import evenly, fingerprint, keep, kept, measure
+from scene_experts.files.anchors.sensitivity import fingerprint, keep, kept, measure, prepare
 from scene_experts.render import choose
 from scene_experts.training.run_folder import OpenRun
 from support.files import run_in_memory
@@ -55,5 +56,10 @@ def test_a_precision_is_kept_with_its_scene_only(tmp_path):
     assert kept(run) is None and isinstance(run, OpenRun)
 
 
-def test_evenly_chosen():
-    assert evenly(range(10), 4) == [0, 3, 6, 9] and evenly([5, 6], 4) == [5, 6]
+def test_the_end_of_a_training_keeps_the_precision(tmp_path):
+    run, draws = replace(run_in_memory("scaffold-gs"), path=tmp_path), choose("auto", "cpu")
+    capture = SimpleNamespace(views=[SimpleNamespace(camera=CAMERA)], train=(0,), background=(0.0, 0.0, 0.0))
+    assert "CPU time" in prepare(run, capture, draws, "cpu")
+    found, wanted = kept(run), measure(run.scene, run.step, [CAMERA], torch.zeros(3), draws, lambda *_: None)
+    assert torch.equal(found.classes, wanted.classes) and torch.equal(found.steps["feature"], wanted.steps["feature"])
+    assert prepare(run, SimpleNamespace(train=()), draws, "cpu") == ""
