@@ -59,12 +59,10 @@ demo: $(STAMP) lpips
 	$(SE) compare $(DEMO_OUT)/scaffold-gs $(DEMO_OUT)/scene-experts
 	$(SE) report $(DEMO_OUT)/scaffold-gs $(DEMO_OUT)/scene-experts --out $(DEMO_OUT)/report.html
 	$(SE) render $(DEMO_OUT)/scene-experts --out $(DEMO_OUT)/orbit.mp4
-	$(SE) export $(DEMO_OUT)/scene-experts --format html --refine 200 --out $(DEMO_OUT)/scene.html
-	$(SE) export $(DEMO_OUT)/scene-experts --format live --out $(DEMO_OUT)/live.html
+	$(SE) export $(DEMO_OUT)/scene-experts --format html --out $(DEMO_OUT)/scene.html
 	@echo
 	@echo "a flight around the scene      $(DEMO_OUT)/orbit.mp4"
 	@echo "the scene as one web page      $(DEMO_OUT)/scene.html"
-	@echo "the same with its networks     $(DEMO_OUT)/live.html"
 	@echo "both methods, pictures, curves $(DEMO_OUT)/report.html"
 	@echo "walk around in a browser       make view, then http://localhost:8080"
 

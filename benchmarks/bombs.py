@@ -206,7 +206,7 @@ def formats() -> dict[str, tuple[Any, Callable[[Path, int, int], None], Callable
     return {
         "spz": (budget.SPZ, write_spz, spz.read),
         "spz4": (budget.SPZ, write_spz4, spz.read),
-        "html": (budget.HTML, write_html, read_html),
+        "baked-html": (budget.HTML, write_html, read_html),
         "sog": (budget.SOG, write_sog, sog.read),
         "compact": (budget.COMPACT, write_compact, compact.read),
         "glb": (budget.GLB, write_glb, glb.read),

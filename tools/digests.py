@@ -34,7 +34,7 @@ CAPTURE = ROOT / "demo" / "buddha"
 ITERATIONS, STOP = 40, 14
 SHORT = ["--iterations", str(ITERATIONS), "--growth.adjust.interval", "4", "--deterministic", "--device", "cpu"]
 READ = ["--data", str(CAPTURE), "--resolution", "longest:64", "--max-views", "12"]
-FORMATS = ("compact", "anchors", "ply", "compressed-ply", "splat", "spz", "sog", "glb", "html")
+FORMATS = ("compact", "anchors", "ply", "compressed-ply", "splat", "spz", "sog", "glb", "baked-html", "html")
 FAMILIES = ("scaffold-gs", "moe-gs", "moe-gs-dist", "moe-gs-balance", "octree-moe-gs", "scaffold-gs-bank", "sags", "3dgs", "3dgs-mcmc")
 APPEARANCE = ("moe-gs", "--scene.appearance", "8")
 

@@ -199,7 +199,7 @@ def _compact(folder: Path) -> None:
 
 
 def _live(folder: Path) -> None:
-    live.write(folder / "scene.live.html", _anchors(), {})
+    live.write(folder / "scene.html", _anchors(), {})
 
 
 def _anchors() -> Any:
@@ -409,7 +409,7 @@ TARGETS: dict[str, Target] = {
     "spz": Target(_gaussians("spz"), _read_only_file, packs={".spz": containers.gzipped}),
     "sog": Target(_gaussians("sog"), _read_only_file, packs={".sog": containers.zipped}),
     "glb": Target(_gaussians("glb"), _read_only_file, packs={".glb": containers.glb}),
-    "html": Target(_gaussians("html"), _read_only_file),
+    "baked-html": Target(_gaussians("baked-html"), _read_only_file),
     "ply-others": Target(_ply_of_others, _read_only_file),
     "compressed-ply-1": Target(_compressed_1, _read_only_file),
     "sog-1": Target(_foreign("scene.sog", lambda s: foreign.zipped(foreign.sogs_1(s))), _read_only_file, packs={".sog": containers.zipped}),
@@ -420,7 +420,7 @@ TARGETS: dict[str, Target] = {
     "ksplat-0": Target(_foreign("scene.ksplat", lambda s: foreign.ksplat(s, 0)), _read_only_file),
     "zip": Target(_zip, _read_only_file, packs={".zip": containers.zipped}),
     "compact": Target(_compact, _scene_of_compact, packs={".compact": containers.compact}),
-    "live": Target(_live, _read_only_file),
+    "html": Target(_live, _read_only_file),
     "networks": Target(_networks, lambda folder: read_tensors(folder / "net.pt"), packs={".pt": containers.zipped}),
     "torchscript": Target(_traces, lambda folder: read_tensors(folder / "net.pt"), packs={".pt": containers.zipped}),
     "result-folder": Target(_result, _read_result, packs={".pt": containers.zipped}),

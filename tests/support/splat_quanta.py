@@ -23,7 +23,7 @@ def scene(n: int = 700, degree: int = 3, seed: int = 0, size: float = 3.0) -> Sp
 
 def in_file_order(format: str, s: Splats) -> Splats:
     """The rows as the format's writer sorts them."""
-    if format in ("compressed-ply", "spz", "sog", "html"):
+    if format in ("compressed-ply", "spz", "sog", "baked-html"):
         return s.rows(morton_order(s.means))
     if format == "splat":
         size = s.log_scales.double().sum(1) + s.opacity_logit.double().sigmoid().clamp_min(1e-30).log()
@@ -48,7 +48,7 @@ def quanta(format: str, s: Splats) -> dict[str, Tensor | float]:
     float32 = {"means": 0.0, "log_scales": 2e-5, "opacity": 1e-6, "quats": 1e-6, "sh": 0.0}
     if format in ("ply", "glb", "usd"):
         return float32
-    return {"splat": _splat, "compressed-ply": _compressed, "spz": _spz, "html": _spz, "sog": _sog}[format](s)
+    return {"splat": _splat, "compressed-ply": _compressed, "spz": _spz, "baked-html": _spz, "sog": _sog}[format](s)
 
 
 def _smallest_three(step: float) -> float:

@@ -42,7 +42,7 @@ def psnr(run: Path) -> float:
     return json.loads((run / "results.json").read_text())["psnr"]
 
 
-@pytest.mark.parametrize("format", ["ply", "compressed-ply", "sog", "spz", "glb", "html"])
+@pytest.mark.parametrize("format", ["ply", "compressed-ply", "sog", "spz", "glb", "baked-html"])
 def test_exports_lose_nothing_to_the_distance(room: Path, format: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["export", str(room / "3dgs"), "--format", format, "--out", str(tmp_path)]) == 0
     assert "relative to (4482" in capsys.readouterr().out

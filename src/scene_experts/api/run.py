@@ -275,15 +275,16 @@ class Run:
         """Write the scene to a file that other tools or later runs read.
 
         Args:
-            format: "compact" is one small file of this package, "live" a web page that decodes its
-                networks. "anchors" is the Scaffold-GS folder layout. "ply", "compressed-ply",
-                "splat", "spz", "sog", "glb", "usd" and "html" (a page with a viewer) are standard
-                files of Gaussians; scenes of anchors are baked for them, which takes minutes.
-                "mesh" is a PLY or GLB file of coloured triangles.
+            format: "compact" is one small file of this package, "html" a web page with it that decodes
+                its networks. "anchors" is the Scaffold-GS folder layout. "ply", "compressed-ply",
+                "splat", "spz", "sog", "glb", "usd" and "baked-html" (a page with a viewer) are
+                standard files of Gaussians; scenes of anchors are baked for them, which takes
+                minutes. "html" of other scenes is that page. "mesh" is a PLY or GLB file of coloured
+                triangles.
             out: File or folder; a name without a suffix is a folder. Default: inside the run
                 folder.
-            quality: compact, live: dB of PSNR that the training views may lose.
-            target_mb: compact, live: write a file of at most this many megabytes in place of
+            quality: compact, html: dB of PSNR that the training views may lose.
+            target_mb: compact, html: write a file of at most this many megabytes in place of
                 `quality`; 0: any size.
             sh_degree: Standard files: degree of the spherical harmonics, 0 to 3.
             max_gaussians: Standard files: keep this many Gaussians, those that contribute most; 0
@@ -298,7 +299,7 @@ class Run:
                 "box:X0,Y0,Z0,X1,Y1,Z1", in the units of the capture's poses.
             floaters: Standard files: "remove" leaves out Gaussians that no training photograph
                 supports.
-            title: html, live: title of the page. Default: the name of the capture.
+            title: html: title of the page. Default: the name of the capture.
             cells: mesh: voxels along its longest side, 8 to 2048.
 
         Returns:

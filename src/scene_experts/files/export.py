@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import check_writable, write_bytes, write_json
@@ -79,6 +80,7 @@ def export_several(
     `export`.
     """
     _check(options)
+    formats, notes = _formats_for(run, formats)
     _expect_for_file(run, formats, out, options)
     if len(formats) > 1 and out is not None:
         if not out.is_dir() and (out.exists() or out.suffix):
@@ -107,7 +109,38 @@ def export_several(
             for work, path in zip(standard, places):
                 for level, file in _files(run, path, options.levels):
                     written.append(export_gaussians(work, file, level, capture, made))
+    if notes:
+        written[-1] = replace(written[-1], lines=(*written[-1].lines, *notes))
     return written
+
+
+def _formats_for(run: OpenRun, formats: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The formats that write this run for those that were asked for, and sentences about others
+    that take their places. Raises InputError for two that would write one file."""
+    names, notes = [], list[str]()
+    for name in dict.fromkeys(formats):
+        format = format_named(name)
+        if format.otherwise and run.scene.traits.family != format.family:
+            name = format.otherwise
+        elif format.otherwise and format.lacks is not None and (found := format.lacks(_contents_of(run, format)[0])):
+            name = format.otherwise
+            notes.append(f"the page holds baked Gaussians, because its script cannot decode {found}")
+        names.append(name)
+    names, suffixes = list(dict.fromkeys(names)), dict[str, str]()
+    for name in names:
+        suffix = format_named(name).suffix
+        if suffix and (other := suffixes.setdefault(suffix, name)) != name:
+            raise InputError(f"expected formats with files of their own, found {other} and {name}, both *{suffix}; export one at a time")
+    return names, notes
+
+
+def _contents_of(run: OpenRun, format: Format) -> tuple[Any, World]:
+    """What a file of a format of the run's own family holds, and its frame."""
+    family, trained = family_named(format.family), world_of(run)
+    assert family is not None
+    origin = origin_of(run, trained)
+    world = trained.seen_from(origin)
+    return family.contents(run, world, family.describe(run, trained) | trained_in(run) | origin_note(origin)), world
 
 
 def place_of(run: OpenRun, name: str, format: Format, out: Path | None) -> Path:
@@ -191,9 +224,10 @@ def _expect_unused(options: Options, format: str) -> None:
             continue
         if f.name in FITTED:
             if format_named(format).fit is None:
-                raise InputError(f"expected {_flag(f.name)} with --format compact, found --format {format}; leave it out")
+                raise InputError(f"expected {_flag(f.name)} with --format compact or html, found --format {format}; leave it out")
         else:
-            raise InputError(f"expected {_flag(f.name)} with a standard file (ply, spz, html, ...), found --format {format}; leave it out")
+            which = "a standard file (ply, spz, baked-html, ...)"
+            raise InputError(f"expected {_flag(f.name)} with {which}, found --format {format}; leave it out")
 
 
 def _flag(name: str) -> str:
@@ -215,9 +249,7 @@ def _export_scene(work: ExportTask, out: Path | None) -> Written:
     if format.is_folder:
         return _export_folder(work, family, trained, out or run.path)
     path = place_of(run, work.name, format, out)
-    origin = origin_of(run, trained)
-    about, world = family.describe(run, trained) | trained_in(run) | origin_note(origin), trained.seen_from(origin)
-    contents, fitted, note = family.contents(run, world, about), [], {}
+    (contents, world), fitted, note = _contents_of(run, format), [], {}
     if format.fit is not None or format.view_note is not None:
         with capture_if_there(run, needed=False) as capture:
             if format.fit is not None:

@@ -21,9 +21,9 @@ class Options:
     """Draw the held-out views from the run and from the file, and say what the file costs in
     PSNR."""
     quality: float = 0.2
-    """compact, live: dB of PSNR that the training views may lose; held-out views lose less."""
+    """compact, html: dB of PSNR that the training views may lose; held-out views lose less."""
     target_mb: float = 0.0
-    """compact, live: write a file of at most this many megabytes (10^6 bytes), as good as it can be,
+    """compact, html: write a file of at most this many megabytes (10^6 bytes), as good as it can be,
     in place of --quality; 0: any size."""
     sh_degree: int = MAX_DEGREE
     """Standard files: degree of the spherical harmonics, 0 (smallest file) to 3 (best)."""
@@ -47,7 +47,7 @@ class Options:
     """Standard files: remove Gaussians that no training photograph supports: those that cover less
     than 0.3 pixels of each, and large, faint ones that fewer than 4 show."""
     title: str | None = None
-    """html, live: title of the page; by default it names the capture."""
+    """html: title of the page; by default it names the capture."""
     cells: Annotated[int, Range(8, 2048)] = 256
     """mesh: voxels along its longest side."""
     levels: bool = False

@@ -45,8 +45,8 @@ FORMATS = {
     "glb": "scene_experts.files.formats.glb",
     "usd": "scene_experts.files.formats.usd",
     "mesh": "scene_experts.files.mesh",
-    "html": "scene_experts.files.formats.html",
-    "live": "scene_experts.files.anchors.live",
+    "baked-html": "scene_experts.files.formats.html",
+    "html": "scene_experts.files.anchors.live",
 }
 """Name on the command line -> module that states the format as `FORMAT`."""
 
@@ -118,6 +118,12 @@ class Format:
     the run, in the frame of its capture. capture: None where it is gone. None: contents are written
     as they are, and those options are refused."""
 
+    otherwise: str = ""
+    """Name of the format that writes in place of this one what this one cannot hold: scenes of other
+    families, and those with parts that it `lacks`."""
+    lacks: Callable[[Any], str] | None = None
+    """lacks(contents): a part of a scene of its family that the format does not know; empty: it
+    knows all."""
     draw: Callable[..., tuple[Any, Note]] | None = None
     """draw(run, capture, options, rasterize, tell): the contents of a file of "drawn", in the
     capture's own frame, and how they were made."""

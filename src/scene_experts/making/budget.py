@@ -10,8 +10,8 @@ from scene_experts.bench.advice import FEW, Advice, suggest
 from scene_experts.core.progress import Progress
 from scene_experts.training.progress import format_duration
 
-FOR_PAGE = 0.2  # share of the time after the poses that the page gets
-LEAST_PAGE, MOST_PAGE = 10.0, 240.0  # seconds of it
+FOR_PAGE = 0.05  # share of the time after the poses that the page gets
+LEAST_PAGE, MOST_PAGE = 15.0, 60.0  # seconds of it
 FOR_SCORES = 0.15  # the same for the scores, where they are asked for
 GROWTH = 1.7
 """Time of a whole training over ten times that of its first tenth: a scene grows. 1.3 to 2.6 in eight
@@ -19,8 +19,7 @@ trainings of 4,000 iterations on banana, brighton, fern and kitchen."""
 LOOK = 0.1  # share of the iterations after which the speed is known
 CLOSE = (0.8, 1.3)  # a training whose time will be this share of what it has is not begun anew
 LEAST, MOST, MOST_OF_FEW = 300, 30_000, 7_000  # iterations; the last with few photographs (`bench.advice.FEW`)
-PAGE_GUESS = 60.0  # seconds, before anything is known
-MOST_REFINE = 1000  # iterations that fit the page's Gaussians; with time for them, the bake decides
+PAGE_GUESS = 20.0  # seconds, before anything is known
 
 
 @dataclass(frozen=True)
@@ -92,16 +91,3 @@ def find_slowness(iterations: int, step: int, seconds: float, minutes: float | N
     if CLOSE[0] <= expected / max(have, 1e-9) <= CLOSE[1]:
         return None
     return expected / 60 / minutes if minutes else expected / max(have, 1e-9)
-
-
-def choose_refinement(left: float | None, iteration: float, base: float) -> int | None:
-    """Return the iterations that fit a page's Gaussians to the scene, for the seconds that are left;
-    None where the bake may choose.
-
-    iteration: Seconds of one iteration of the training at its end. base: Seconds of the page without
-    any.
-    """
-    if left is None:
-        return None
-    fits = max(int((left - base) / max(iteration, 1e-9)), 0)
-    return fits if fits < MOST_REFINE else None

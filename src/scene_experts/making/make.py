@@ -20,7 +20,7 @@ from scene_experts.core.progress import Progress
 from scene_experts.data.readers import is_capture
 from scene_experts.files.export import export_several
 from scene_experts.files.options import Options
-from scene_experts.making.budget import LOOK, PAGE_GUESS, TimeBudget, Whole, choose_refinement, find_slowness, plan_training
+from scene_experts.making.budget import LOOK, PAGE_GUESS, TimeBudget, Whole, find_slowness, plan_training
 from scene_experts.sfm.options import SfmOptions
 from scene_experts.sfm.reconstruct import reconstruct
 from scene_experts.training import run_folder
@@ -29,7 +29,6 @@ from scene_experts.training.recipes import PROPOSED
 
 CAPTURE, RUN, PAGE, SOURCE = "capture", "run", "scene.html", "source.json"
 RECENT = 200  # iterations whose time counts as that of one at the end
-PER_VIEW = 0.2  # seconds of a page for each training view, without refinement
 
 
 @dataclass(frozen=True)
@@ -91,8 +90,7 @@ def make(
     took["poses"] = monotonic() - began
     plan = prepare(place, folder / RUN, budget, scores, say)
     show.later, began = PAGE_GUESS if budget.left is None else budget.left - (budget.for_training(scores) or 0.0), monotonic()
-    run, psnr, iteration = train(plan, folder / RUN, budget, scores, show)
-    views = len(plan.capture.train_cameras)
+    run, psnr = train(plan, folder / RUN, budget, scores, show)
     took["training"] = monotonic() - began
     report, began, show.later = None, monotonic(), 0.0
     if scores:
@@ -101,8 +99,7 @@ def make(
         report = run.report()
     took["scores"] = monotonic() - began
     began = monotonic()
-    refine = choose_refinement(budget.left, iteration, PER_VIEW * views)
-    page = write_page(folder, Options(measure=False, refine=refine, title=source.resolve().stem), show)
+    page = write_page(folder, Options(measure=False, title=source.resolve().stem), show)
     took["page"] = monotonic() - began
     return MadeScene(page, folder / RUN, place, report, psnr, took)
 
@@ -172,12 +169,11 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
     return plan
 
 
-def train(plan: TrainingPlan, folder: Path, budget: TimeBudget, scores: bool, progress: Progress) -> tuple[Run, float | None, float]:
+def train(plan: TrainingPlan, folder: Path, budget: TimeBudget, scores: bool, progress: Progress) -> tuple[Run, float | None]:
     """Train. Where the first tenth shows that the machine is slower or faster than estimated, the
     training begins anew, once, with what fits the time.
 
-    Returns the run, the mean PSNR of the last training views, and the seconds of an iteration at
-    the end.
+    Returns the run, and the mean PSNR of the last training views.
     """
     settled = plan.begun
     while True:
@@ -198,9 +194,7 @@ def train(plan: TrainingPlan, folder: Path, budget: TimeBudget, scores: bool, pr
             break
         plan = plan.fit(budget.for_training(scores), slow)
     psnr = fmean(one.psnr for one in recent) if recent else None
-    steps = recent[-1].step - recent[0].step if recent else 0
-    iteration = (recent[-1].seconds - recent[0].seconds) / steps if steps else 0.1
-    return trainer.run, psnr, iteration
+    return trainer.run, psnr
 
 
 def write_page(folder: Path, options: Options, progress: Progress) -> Path:

@@ -164,21 +164,21 @@ def test_a_live_page_knows_the_photographs_places_with_and_without_them(tmp_path
     data = make_capture(tmp_path / "capture", views=10).folder
     opened = trained("octree-gs", data, tmp_path / "run")
     settings = lambda path: json.loads(path.read_text().split('id="settings">')[1].split("</script>")[0])  # noqa: E731
-    (written,) = export_run(opened.path, "live", title="Our <garden>", measure=True)
-    assert written.path == opened.path / "scene.live.html" and "<title>Our &lt;garden&gt;</title>" in written.path.read_text()
+    (written,) = export_run(opened.path, "html", title="Our <garden>", measure=True)
+    assert written.path == opened.path / "scene.html" and "<title>Our &lt;garden&gt;</title>" in written.path.read_text()
     assert "PSNR" in written.lines[-1] and abs(written.psnr["file"] - written.psnr["run"]) < 0.5
     found = settings(written.path)
     near = captures.load(opened.config.data).views[0].camera.near / world_of(opened).scale
     assert len(found["poses"]) == 10 and found["reach"] > 0 and found["nearest"] == pytest.approx(near)
     assert found["heads"]["cov"]["distance"] == 2.0 ** round(math.log2(world_of(opened).scale)) and found["levels"]["rule"] == "round"
     data.rename(tmp_path / "elsewhere")
-    again = settings(export_run(opened.path, "live", tmp_path / "a.html")[0].path)
+    again = settings(export_run(opened.path, "html", tmp_path / "a.html")[0].path)
     assert len(again["poses"]) == 10  # those of cameras.json
     (opened.path / "cameras.json").unlink()
-    around = settings(export_run(opened.path, "live", tmp_path / "b.html")[0].path)
+    around = settings(export_run(opened.path, "html", tmp_path / "b.html")[0].path)
     assert len(around["poses"]) == 1 and around["reach"] is None  # nothing was photographed from there
-    with pytest.raises(InputError, match=naming("--refine", "live")):
-        export_run(opened.path, "live", refine=3)
+    with pytest.raises(InputError, match=naming("--refine", "html")):
+        export_run(opened.path, "html", refine=3)
     with pytest.raises(InputError, match=naming("--title", "compact")):
         export_run(opened.path, "compact", title="a")
 

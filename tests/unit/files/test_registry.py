@@ -42,7 +42,7 @@ def test_every_format_is_recognised_by_its_content(tmp_path, format):
 
 
 def test_formats_state_what_they_are():
-    assert set(format_names()) >= {"anchors", "compact", *STANDARD} and set(formats_of("anchors")) == {"anchors", "compact", "live"}
+    assert set(format_names()) >= {"anchors", "compact", *STANDARD} and set(formats_of("anchors")) == {"anchors", "compact", "html"}
     suffixes = [format_named(name).suffix for name in format_names()]
     assert len(set(suffixes)) == len(suffixes) and all(about(name) for name in format_names())
     assert [name for name in format_names() if format_named(name).is_folder] == ["anchors"]
@@ -125,7 +125,7 @@ def good(tmp_path_factory):
 def test_damage_of_any_kind_is_a_sentence_or_a_scene(good, tmp_path_factory, format, seed, times, kind):
     """Bytes changed anywhere: an InputError, or Gaussians of sound shapes; no other error, no endless work."""
     data = bytearray(good[format])
-    end = data.find(b'id="code"') if format == "html" else len(data)  # its renderer is no part of the scene
+    end = data.find(b'id="code"') if format == "baked-html" else len(data)  # its renderer is no part of the scene
     for i in range(times):
         at = (seed >> i) * 2654435761 % min(end, len(data))
         if kind == "flip":

@@ -11,7 +11,6 @@ from scene_experts.making.budget import (
     MOST_OF_FEW,
     TimeBudget,
     Whole,
-    choose_refinement,
     find_slowness,
     plan_training,
 )
@@ -36,7 +35,7 @@ def test_the_training_gets_what_page_and_scores_leave():
     clock.time += 1000.0
     assert budget.left == 0 and budget.for_training(True) == 0
     free = TimeBudget(None, clock)
-    assert free.left is None and free.for_training(True) is None and choose_refinement(None, 1.0, 1.0) is None
+    assert free.left is None and free.for_training(True) is None
 
 
 def test_a_training_fills_the_time_that_it_has(monkeypatch):
@@ -57,11 +56,6 @@ def test_how_slow_the_machine_is_follows_from_the_first_iterations():
     assert find_slowness(400, 40, 4.0, 1.0, fits) is None and find_slowness(400, 40, 4.0, 1.0, 1.1 * fits) is None
     assert find_slowness(400, 40, 4.0, fits / 60 / 3, fits / 2) == pytest.approx(3)
     assert find_slowness(400, 40, 4.0, None, fits / 2) == pytest.approx(2) and find_slowness(400, 40, 4.0, 1.0, 3 * fits) is not None
-
-
-def test_the_page_is_refined_as_long_as_time_is_left():
-    assert choose_refinement(60.0, 0.1, 10.0) == 500 and choose_refinement(1e6, 0.1, 10.0) is None
-    assert choose_refinement(5.0, 0.1, 10.0) == 0
 
 
 def test_the_time_left_is_that_of_the_stage_and_of_those_after_it():

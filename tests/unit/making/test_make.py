@@ -54,7 +54,7 @@ def trained(monkeypatch):
             self.stopped = True
 
     def export(opened, formats, page, options, tell):
-        page.write_text(json.dumps({"refine": options.refine, "title": options.title}))
+        page.write_text(json.dumps({"title": options.title}))
         return [page]
 
     monkeypatch.setattr(making, "Trainer", Trainer)
@@ -70,7 +70,7 @@ def test_all_photographs_are_trained_on_and_a_page_is_written(capture, tmp_path,
     made = make(capture, tmp_path / "out", say=said.append)
     (one,) = trained.made
     assert len(one.capture.train_cameras) == 9 and one.recipe.recipe == PROPOSED and one.recipe.iterations == 1000
-    assert made.page == tmp_path / "out" / "scene.html" and json.loads(made.page.read_text()) == {"refine": None, "title": "box"}
+    assert made.page == tmp_path / "out" / "scene.html" and json.loads(made.page.read_text()) == {"title": "box"}
     assert (
         made.report is None
         and made.psnr == 25.0

@@ -35,6 +35,7 @@ from scene_experts.scene.anchors.levels import Levels
 from scene_experts.scene.anchors.mlp import ATTRIBUTES
 from scene_experts.training.run_folder import OpenRun
 
+BAKED = "baked-html"
 GENERATOR = "scene-experts live"
 MARK = f'<meta name="generator" content="{GENERATOR}">'.encode()
 LICENCE = "scene-experts, Apache-2.0"
@@ -69,6 +70,12 @@ def read(path: Path) -> AnchorData:
 
 def expect_drawable(data: AnchorData) -> None:
     """Raises InputError for a scene with parts that the script does not know."""
+    if found := find_unknown(data):
+        raise InputError(f"expected a scene that the page's script can decode, found {found}; use --format baked-html")
+
+
+def find_unknown(data: AnchorData) -> str:
+    """What of a scene the script does not know; empty if it knows everything."""
     about = data.about or {}
     config = (about.get("train") or {}).get("scene") or {}
     decoder, select = config.get("decoder") or {}, (config.get("select") or {}).get("type")
@@ -83,8 +90,7 @@ def expect_drawable(data: AnchorData) -> None:
         found = f"anchors that {select} selects"
     elif mixed and (decoder.get("type") != "Experts" or decoder.get("router", {}).get("type") not in ROUTERS):
         found = f"experts that {decoder.get('router', {}).get('type', decoder.get('type'))} chooses"
-    if found:
-        raise InputError(f"expected a scene that the live page can decode, found {found}; use --format html, which bakes it")
+    return found
 
 
 def page_settings(data: AnchorData, note: Mapping[str, Any]) -> dict[str, Any]:
@@ -173,8 +179,7 @@ def fit(
 
 
 FORMAT = Format(
-    suffix=".live.html",
-    other_suffixes=(".html",),
+    suffix=".html",
     family="anchors",
     write=write,
     read=read,
@@ -182,4 +187,6 @@ FORMAT = Format(
     looks_like=lambda path, head: MARK in head,
     view_note=view_note,
     fit=fit,
+    otherwise=BAKED,
+    lacks=find_unknown,
 )

@@ -43,9 +43,9 @@ def test_a_page_holds_the_compact_file_and_is_recognised(tmp_path, case):
     found, wanted = live.read(tmp_path / "a.html"), compact.read(tmp_path / "a.compact")
     assert all(torch.equal(found.columns[name], value) for name, value in wanted.columns.items())
     assert all(torch.equal(found.networks[name], value) for name, value in wanted.networks.items())
-    assert recognise(tmp_path / "a.html")[0] == "live" and b"<title>&lt;b&gt;</title>" in (tmp_path / "a.html").read_bytes()
+    assert recognise(tmp_path / "a.html")[0] == "html" and b"<title>&lt;b&gt;</title>" in (tmp_path / "a.html").read_bytes()
     html.write(tmp_path / "b.html", splats(4), {})
-    assert recognise(tmp_path / "b.html")[0] == "html"
+    assert recognise(tmp_path / "b.html")[0] == "baked-html"
 
 
 def test_settings_say_how_to_decode(tmp_path):
@@ -87,7 +87,7 @@ def test_what_the_script_cannot_draw_is_refused(tmp_path):
         "Oracle chooses": replace(moe, about={**moe.about, "train": {"scene": router}}),
     }
     for found, data in cases.items():
-        with pytest.raises(InputError, match=naming("live page", found, "--format html")):
+        with pytest.raises(InputError, match=naming("script", found, "--format baked-html")):
             live.write(tmp_path / "a.html", data, {})
     assert not (tmp_path / "a.html").exists()
 

@@ -169,7 +169,7 @@ def test_the_page_in_a_browser(tmp_path):
 def test_the_scene_comes_back_out_of_the_page(tmp_path):
     s = scene(200, 2)
     write(tmp_path / "a.html", s, {})
-    check("html", read(tmp_path / "a.html"), s)
+    check("baked-html", read(tmp_path / "a.html"), s)
     text = (tmp_path / "a.html").read_text()
     assert not re.search(r"""(src|href)=["']?(https?:)?//""", text) and "WORLD LABS" in text
     assert text.count("</script>") == 4
@@ -180,7 +180,7 @@ def test_a_page_holds_scenes_in_any_unit(tmp_path, factor):
     s = scaled(scene(200, 1, size=1.0), factor)
     assert write(tmp_path / "a.html", s, {}) is None
     found = read(tmp_path / "a.html")
-    check("html", scaled(found, 1 / factor), scaled(s, 1 / factor))
+    check("baked-html", scaled(found, 1 / factor), scaled(s, 1 / factor))
     unit = page_settings(s, {})["unit"]
     assert unit != 1 and math.frexp(unit)[0] == 0.5 and f'"unit": {unit}' in (tmp_path / "a.html").read_text()
     assert page_settings(scene(200), {})["unit"] == 1

@@ -124,7 +124,7 @@ def test_every_standard_file_comes_back_as_a_run(made, tmp_path, format):
     )
     assert (drawn(out) - drawn(run)).abs().mean() < 0.02
     whole = file.read_bytes()
-    end = whole.find(b'id="scene"') + 500 if format == "html" else len(whole) * 2 // 3 // 32 * 32 + 5
+    end = whole.find(b'id="scene"') + 500 if format == "baked-html" else len(whole) * 2 // 3 // 32 * 32 + 5
     file.write_bytes(whole[:end])
     with pytest.raises(InputError, match=r"^[^\n]+$"):
         import_files(file, Data(folder), tmp_path / "damaged")
@@ -139,7 +139,7 @@ def test_beside_a_description_of_more_harmonics_the_file_says_the_degree(made, t
     assert opened.step == 90 and opened.scene.config.sh_degree == 0
 
 
-@pytest.mark.parametrize("format", ["spz", "html", "ply", "compressed-ply", "sog"])
+@pytest.mark.parametrize("format", ["spz", "baked-html", "ply", "compressed-ply", "sog"])
 def test_a_file_says_by_itself_whether_it_is_antialiased(made, tmp_path, format):
     run, folder = made
     opened, name = run_folder.open_run(run), f"scene{registry.format_named(format).suffix}"
