@@ -2,6 +2,7 @@
 
 from scene_experts import cli
 from scene_experts.commands.capture import summarise
+from scene_experts.training.recipes import PROPOSED
 from support.photos import fake_worker, write_black
 
 NOTE = {
@@ -39,7 +40,7 @@ def test_a_capture_and_the_next_command(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("scene_experts.sfm.reconstruct.run_worker", fake_worker(**said))
     assert cli.main(["capture", str(write_black(tmp_path / "photos")), "--out", str(tmp_path / "box")]) == 0
     out = capsys.readouterr().out
-    assert "3 photographs" in out and f"scene-experts train scaffold-gs --data {tmp_path / 'box'} --out RUN" in out
+    assert "3 photographs" in out and f"scene-experts train {PROPOSED} --data {tmp_path / 'box'} --out RUN" in out
 
 
 def test_unusable_input_is_told(tmp_path, capsys):

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from scene_experts.cli import main
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Mode
 from scene_experts.data import capture as captures
@@ -17,7 +18,7 @@ from scene_experts.evaluate.metrics import psnr
 from scene_experts.files import registry
 from scene_experts.files.anchors import compact
 from scene_experts.files.anchors.read import read_anchors, read_folder
-from scene_experts.files.export import Options, export, file_path
+from scene_experts.files.export import Options, export, export_several, file_path
 from scene_experts.files.importing import import_files
 from scene_experts.files.measure import Painter
 from scene_experts.files.registry import GAUSSIANS, format_named
@@ -270,3 +271,20 @@ def test_a_family_without_files_leaves_its_cameras_and_can_be_baked(folder, tmp_
     with pytest.raises(InputError, match="--format ply"):
         export(opened, "compact")
     assert export(opened, "ply", options=Options(False, refine=0))[0].path.is_file()
+
+
+def test_a_page_is_baked_where_its_script_cannot_decode_the_scene(tmp_path):
+    data, found = make_capture(tmp_path / "capture", views=5, size=(24, 16), points=60).folder, {}
+    words = ["--data", str(data), "--iterations", "20", "--device", "cpu", "--preview-every", "0"]
+    for recipe in ("3dgs", "scaffold-gs-bank", "scaffold-gs"):
+        assert main(["train", recipe, "--out", str(tmp_path / recipe), *words]) == 0
+        (found[recipe],) = export_run(tmp_path / recipe, "html", tmp_path / f"{recipe}.html")
+    assert {recipe: registry.recognise(page.path)[0] for recipe, page in found.items()} == {
+        "3dgs": "baked-html",
+        "scaffold-gs-bank": "baked-html",
+        "scaffold-gs": "html",
+    }
+    said = {recipe: "cannot decode a feature bank" in page.lines[-1] for recipe, page in found.items()}
+    assert said == {"3dgs": False, "scaffold-gs-bank": True, "scaffold-gs": False}
+    with pytest.raises(InputError, match=naming("html and baked-html")):
+        export_several(run_folder.open_run(tmp_path / "scaffold-gs"), ("html", "baked-html"), tmp_path / "out")

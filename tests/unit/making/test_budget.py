@@ -28,10 +28,10 @@ def test_the_training_gets_what_page_and_scores_leave():
     clock = Clock()
     budget = TimeBudget(600.0, clock)
     clock.time += 100.0
-    assert budget.left == pytest.approx(500) and budget.for_training(False) == pytest.approx(400)
-    assert budget.for_training(True) == pytest.approx(325)
-    clock.time += 490.0
-    assert budget.for_training(False) == pytest.approx(10 - LEAST_PAGE)
+    assert budget.left == pytest.approx(500) and budget.for_training(False) == pytest.approx(475)
+    assert budget.for_training(True) == pytest.approx(400)
+    clock.time += 480.0
+    assert budget.for_training(False) == pytest.approx(20 - LEAST_PAGE)
     clock.time += 1000.0
     assert budget.left == 0 and budget.for_training(True) == 0
     free = TimeBudget(None, clock)

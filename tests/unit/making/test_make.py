@@ -89,7 +89,7 @@ def test_a_training_that_would_not_fit_begins_anew_with_other_iterations(capture
     make(capture, tmp_path / "out", minutes=1.5, say=lambda _: None)
     first, second = trained.made
     assert first.stopped and not second.stopped
-    assert second.recipe.iterations == pytest.approx(72 / (170 / 60) * 10, rel=0.02)  # a fifth of 90 s is the page's; 170 s for 1 min
+    assert second.recipe.iterations == pytest.approx(75 / (170 / 60) * 10, rel=0.02)  # 15 of 90 s are the page's; 170 s for 1 min
 
 
 def test_a_repeated_call_continues_the_training_and_keeps_the_page(capture, tmp_path, trained, monkeypatch):
