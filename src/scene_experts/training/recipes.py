@@ -33,7 +33,7 @@ from scene_experts.training.recipe_book import Recipe, RecipeBook
 EXPERTS = Experts(num=5, top_k=2, warmup=1500)
 AFTER_GROWTH = (15_000, 22_500)  # iterations: the end of growth, and the middle of what follows
 FEW = 46  # training views up to which a plane sweep gives the first points
-PROPOSED = "scene-experts"
+PROPOSED = "one-network"
 """The recipe that `info` and `capture` propose and `make` trains."""
 
 scaffold_gs: Train = Train(recipe="scaffold-gs", scene=Anchors(decoder=Plain()), loss=Weights(scale=0.01))
@@ -71,9 +71,17 @@ def _flagship(name: str, decoder: Decoder, hidden: int) -> Train:
     return replace(
         scaffold_gs,
         recipe=name,
-        scene=Anchors(hidden=hidden, decoder=decoder, dropout=0.2, view_jitter=0.5, few_views=20, few_fall=AFTER_GROWTH),
+        scene=Anchors(hidden=hidden, decoder=decoder, dropout=0.2, view_jitter=0.5, few_views=20),
         loss=Weights(scale=0.01, opacity=0.01),
         rates=Rates(networks=2.0, anneal=0.1),
+    )
+
+
+def _for_photographs(name: str) -> Train:
+    plain = _flagship(name, Plain(), 64)
+    return replace(
+        plain,
+        scene=replace(plain.scene, few_fall=AFTER_GROWTH),
         dense_views=FEW,
         mean_background=True,
         random_background=True,
@@ -86,6 +94,10 @@ def _scaffold(name: str, **scene: object) -> Train:
 
 
 OWN: dict[str, Recipe] = {
+    "one-network": (
+        "one network per attribute, for photographs of your own: few or many (ours, the default)",
+        _for_photographs("one-network"),
+    ),
     "scaffold-gs": ("Scaffold-GS: one network per attribute (the baseline)", scaffold_gs),
     "scene-experts": (
         "Scene Experts: five experts per attribute, each for one part of the scene (ours)",

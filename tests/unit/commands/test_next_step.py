@@ -11,7 +11,7 @@ from scene_experts.data.settings import Data
 
 def test_the_command_is_one_of_train_with_its_time():
     line = propose_training(Data(Path("a folder")), 640, 480, 50)
-    assert line.startswith("next: scene-experts train scene-experts --data 'a folder' --out RUN") and "min on this machine" in line
+    assert line.startswith("next: scene-experts train one-network --data 'a folder' --out RUN") and "min on this machine" in line
     words = shlex.split(line.partition("  #")[0])[3:]
     assert parse_train(words).out == Path("RUN")
 

@@ -108,7 +108,7 @@ def test_the_help_without_a_recipe_lists_methods_and_with_all_every_recipe_once(
     lines = str(asked.value).splitlines()
     before = lines[: lines.index("Examples:")]  # a line of an example begins with the name of the program
     named = [line.split()[0] for line in before if line.startswith("  ") and line.split()[0] in RECIPES]
-    methods = ["3dgs", "3dgs-mcmc", "moe-gs", "octree-gs", "octree-moe-gs", "sags", "scaffold-gs", "scene-experts"]
+    methods = ["3dgs", "3dgs-mcmc", "moe-gs", "octree-gs", "octree-moe-gs", "one-network", "sags", "scaffold-gs", "scene-experts"]
     assert sorted(named) == (sorted(RECIPES) if flag == "--help-all" else methods) and max(map(len, lines)) <= 80
 
 
