@@ -36,6 +36,7 @@ EXTRA = {  # of no paper that is compared
     "scaffold-gs-wide": 3 * 160 * 36 + 161 * 110,  # 160 hidden units
     "scaffold-gs-dist": PLAIN + 32 * 3,
     "scene-experts": 5 * (3 * 64 * 36 + 65 * 110 + 3 * 36),  # 64 hidden units; routers see features and positions
+    "one-network": 3 * 64 * 36 + 65 * 110,
     "scene-experts-one": 3 * 64 * 36 + 65 * 110,
     "scene-experts-wide": 3 * 320 * 36 + 321 * 110,
 }
