@@ -11,7 +11,7 @@ from typing import Any
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import check_writable, write_bytes, write_json
 from scene_experts.data.views import Capture, World
-from scene_experts.files.measure import Tell, capture_if_there, cost
+from scene_experts.files.measure import OF_THE_FORMAT, Tell, capture_if_there, cost
 from scene_experts.files.options import DEFAULT, MAX_DEGREE, Options
 from scene_experts.files.placed import AROUND, place_cameras
 from scene_experts.files.registry import GAUSSIANS, Family, Format, Note, family_named, format_named, format_names, formats_of
@@ -21,6 +21,7 @@ from scene_experts.render import Rasterizer
 from scene_experts.training.run_folder import OpenRun
 
 DRAWN_OPTIONS = ("measure", "crop", "cells")  # of formats that hold what pictures show
+OF_THE_PRECISION = "its values are rounded too coarsely: ask for a smaller --quality or a larger --target-mb"
 FITTED = ("quality", "target_mb")  # options of formats that choose a precision
 NAME = "scene"  # of files whose name the caller does not choose
 
@@ -87,6 +88,7 @@ def export_several(
             raise InputError(f"expected a folder as --out for several formats, found {out}; name a folder")
         out.mkdir(parents=True, exist_ok=True)
     works = [ExportTask(run, name, format_named(name), options, rasterize, tell, command) for name in dict.fromkeys(formats)]
+    _expect_fitted(works, options)
     standard, places = [], []
     for work in works:
         if work.format.family == GAUSSIANS:
@@ -112,6 +114,16 @@ def export_several(
     if notes:
         written[-1] = replace(written[-1], lines=(*written[-1].lines, *notes))
     return written
+
+
+def _expect_fitted(works: Sequence[ExportTask], options: Options) -> None:
+    """Raises InputError for a precision that none of the formats has."""
+    unused = [name for name in FITTED if getattr(options, name) != getattr(DEFAULT, name)]
+    if unused and works and not any(work.format.fit for work in works):
+        instead = "; --max-gaussians, --prune and --sh-degree make this file smaller" if works[0].format.family == GAUSSIANS else ""
+        raise InputError(
+            f"expected {_flag(unused[0])} with --format compact or html, found --format {works[0].name}; leave it out{instead}"
+        )
 
 
 def _formats_for(run: OpenRun, formats: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -263,7 +275,9 @@ def _export_scene(work: ExportTask, out: Path | None) -> Written:
         return written
     with capture_if_there(run, needed=False) as capture:
         found = cost(run, lambda: {"file": family.scene(run, format.read(path), world)}, capture, work.rasterize, work.tell)  # type: ignore[misc]
-    return replace(written, lines=(*written.lines, *found.lines), psnr=found.psnr)
+    mend = OF_THE_PRECISION if format.fit is not None else OF_THE_FORMAT
+    lines = [line.replace(OF_THE_FORMAT, mend) for line in found.lines]
+    return replace(written, lines=(*written.lines, *lines), psnr=found.psnr)
 
 
 def _export_drawn(work: ExportTask, out: Path | None) -> Written:

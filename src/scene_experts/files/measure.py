@@ -102,9 +102,9 @@ def cost(
     before, after = found["run"].photographs, found["file"].photographs
     lines = [f"PSNR of {len(views)} held-out views: run {before:.3f} dB, this file {after:.3f} dB ({after - before:+.3f})"]
     if "bake" in found:
-        baked = found.get("closed_form", found["bake"]).photographs
-        refined = f", refined {found['bake'].photographs:.3f} dB" if "closed_form" in found else ""
-        lines.append(f"on the way: baked {baked:.3f} dB{refined}; PSNR against the run's pictures {found['file'].first:.2f} dB")
+        bake = f"{found['bake'].photographs:.3f} dB"
+        way = f"baked {found['closed_form'].photographs:.3f} dB, refined {bake}" if "closed_form" in found else f"the bake {bake}"
+        lines.append(f"on the way: {way}; PSNR against the run's pictures {found['file'].first:.2f} dB")
     plain: dict[str, Any] = {name: {"photographs": round(s.photographs, 6), "run": round(s.first, 6)} for name, s in found.items()}
     psnr = {name: score.photographs for name, score in found.items()}
     if before - after > LOSS:

@@ -90,7 +90,7 @@ def make(
     took["poses"] = monotonic() - began
     plan = prepare(place, folder / RUN, budget, scores, say)
     show.later, began = PAGE_GUESS if budget.left is None else budget.left - (budget.for_training(scores) or 0.0), monotonic()
-    run, psnr = train(plan, folder / RUN, budget, scores, show)
+    run, psnr = train(plan, folder / RUN, budget, scores, show, say)
     took["training"] = monotonic() - began
     report, began, show.later = None, monotonic(), 0.0
     if scores:
@@ -155,7 +155,10 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
         begun = run_folder.read_config(folder)
         if (begun.data.split == "none") is scores:
             told = "none was" if begun.data.split == "none" else f"{begun.data.split} was"
-            raise InputError(f"expected a run with the same photographs held out in {folder}, found one where {told}; choose another --out")
+            raise InputError(
+                f"expected a run with the same photographs held out in {folder}, found one where {told}; "
+                f"{'leave --scores out' if scores else 'add --scores'}, or choose another --out"
+            )
         say(f"training: continues that in {folder}")
         capture = load_capture(place, split=split, resolution=begun.data.resolution, seed=begun.train.seed)
         return TrainingPlan(place, split, (0, 0), capture, begun.train, begun=True)
@@ -169,7 +172,9 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
     return plan
 
 
-def train(plan: TrainingPlan, folder: Path, budget: TimeBudget, scores: bool, progress: Progress) -> tuple[Run, float | None]:
+def train(
+    plan: TrainingPlan, folder: Path, budget: TimeBudget, scores: bool, progress: Progress, say: Callable[[str], None]
+) -> tuple[Run, float | None]:
     """Train. Where the first tenth shows that the machine is slower or faster than estimated, the
     training begins anew, once, with what fits the time.
 
@@ -193,6 +198,9 @@ def train(plan: TrainingPlan, folder: Path, budget: TimeBudget, scores: bool, pr
         if slow is None:
             break
         plan = plan.fit(budget.for_training(scores), slow)
+        how = "slower" if slow > 1 else "faster"
+        now = f"{plan.recipe.iterations:,} iterations, {plan.capture.data.resolution}"
+        say(f"the machine is {how} than estimated: the training begins anew, {now}")
     psnr = fmean(one.psnr for one in recent) if recent else None
     return trainer.run, psnr
 

@@ -288,3 +288,16 @@ def test_a_page_is_baked_where_its_script_cannot_decode_the_scene(tmp_path):
     assert said == {"3dgs": False, "scaffold-gs-bank": True, "scaffold-gs": False}
     with pytest.raises(InputError, match=naming("html and baked-html")):
         export_several(run_folder.open_run(tmp_path / "scaffold-gs"), ("html", "baked-html"), tmp_path / "out")
+
+
+def test_a_precision_that_no_format_has_is_refused_at_once(tmp_path):
+    data = make_capture(tmp_path / "capture", views=4, size=(24, 16), points=60).folder
+    words = ["--data", str(data), "--iterations", "20", "--device", "cpu", "--preview-every", "0"]
+    assert main(["train", "scaffold-gs", "--out", str(tmp_path / "run"), *words]) == 0
+    for format in ("sog", "baked-html"):
+        with pytest.raises(InputError, match=naming("--target-mb", format, "--max-gaussians")):
+            export_run(tmp_path / "run", format, tmp_path / "a", target_mb=2.0)
+    with pytest.raises(InputError, match=naming("--quality", "mesh")):
+        export_run(tmp_path / "run", "mesh", tmp_path / "a", quality=0.5)
+    (page,) = export_run(tmp_path / "run", "html", tmp_path / "a.html", target_mb=0.09)
+    assert page.bytes <= 90_000

@@ -40,6 +40,7 @@ GENERATOR = "scene-experts live"
 MARK = f'<meta name="generator" content="{GENERATOR}">'.encode()
 LICENCE = "scene-experts, Apache-2.0"
 CODE = "live.min.js.gz"
+SPARE = 1000  # bytes for a title, and for numbers that are longer in the frame of the page
 ROUTERS = {"Linear": "softmax", "Places": "softmax", "Margin": "margin", "Balanced": "balanced"}
 """Routers by the type in a description -> how the script weighs the experts that they choose."""
 LARGEST_HALF = 60_000.0  # beyond it the script holds values in 32 bits
@@ -172,8 +173,10 @@ def fit(
     """See `registry.Format.fit`; `target_mb` is the size of the whole page."""
     expect_drawable(contents)
 
+    note = {} if capture is None or options.target_mb == 0 else view_note(capture, world)
+
     def size(data: AnchorData) -> int:
-        return len(make_page(data, {}, compact.encode(data)[0]))
+        return SPARE + len(make_page(data, note, compact.encode(data)[0]))
 
     return choose_precision(run, contents, world, options, capture, rasterize, tell, size)
 

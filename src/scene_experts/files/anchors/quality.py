@@ -21,7 +21,7 @@ from scene_experts.files.anchors.precision import Precision
 from scene_experts.files.anchors.read import scene as scene_of
 from scene_experts.files.anchors.rounding import rounded
 from scene_experts.files.anchors.sensitivity import keep, kept, measure
-from scene_experts.files.measure import Painter, Tell
+from scene_experts.files.measure import LOSS, Painter, Tell
 from scene_experts.files.options import Options
 from scene_experts.files.placed import place_cameras
 from scene_experts.files.scene_folder import origin_of
@@ -193,5 +193,8 @@ def choose_precision(
             at = START - 30 if found is None else found
         lost, against = loss(at), "" if judge.has_photographs else " (estimated, without photographs)"
         also = "; values have the steps that the training learned" if unit.learned else ""
-        line = f"{len(judge.views)} training views lose {lost:.3f} dB{against}{also}"
-        return replace(contents, precision=unit.at(2.0**at)), [line]
+        lines = [f"{len(judge.views)} training views lose {lost:.3f} dB{against}{also}"]
+        if lost > LOSS:
+            asked = "a larger --target-mb" if options.target_mb else "a smaller --quality"
+            lines.append(f"warning: values are rounded so coarsely that pictures change; ask for {asked}")
+        return replace(contents, precision=unit.at(2.0**at)), lines
