@@ -21,6 +21,15 @@ def kernels(module: str = "scene_experts.scene.anchors.triton_kernels"):
     return importlib.import_module(module)
 
 
+def decode_by_triton(rows, xyz, feature, log_scaling, offsets, position, heads, with_dist, extent, outside, rounding=None):
+    """`native_decode.decode` by the kernels, as a scene on CUDA calls them."""
+    from scene_experts.scene.anchors import triton_decode
+
+    columns = (feature, log_scaling, offsets)
+    columns = columns if rounding is None else rounding.round(columns)
+    return triton_decode.decode(rows, xyz, *columns, position, heads, with_dist, extent, outside)
+
+
 COMPILE = """
 import importlib, json, os, re, subprocess, sys, tempfile, triton
 from triton.backends.compiler import GPUTarget

@@ -11,14 +11,13 @@ import torch
 from scene_experts.core.types import Mode
 from scene_experts.render import choose, for_training
 from scene_experts.scene.anchors import scene as anchors
-from scene_experts.scene.anchors import triton_decode
 from scene_experts.scene.anchors.routers import Margin
 from scene_experts.scene.anchors.select import Octree
 from scene_experts.training.direct import DirectStep, ThroughAutograd
 from scene_experts.training.losses import Sample, Weights, compute_terms
 from scene_experts.training.recipes import RECIPES
 from support.captures import load
-from support.interpret import DEVICE, kernels
+from support.interpret import DEVICE, decode_by_triton, kernels
 from support.synthetic import make_capture
 from support.trainings import start_changed
 
@@ -120,7 +119,7 @@ def distance(a, b):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_a_view_is_that_of_autograd(name, capture, monkeypatch):
-    monkeypatch.setattr(anchors, "native_decode", triton_decode)  # else an alpha may pass its threshold in one of the two
+    monkeypatch.setattr(anchors.native_decode, "decode", decode_by_triton)  # else an alpha may pass its threshold in one of the two
     cfg, step, why = CASES[name]
     found, expected = see(capture, cfg, step, name, True), see(capture, cfg, step, name, False)
     assert why in found[5] and bool(why) == bool(found[5])

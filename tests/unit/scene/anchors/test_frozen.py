@@ -7,7 +7,7 @@ import torch
 
 from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.native import library as native
-from scene_experts.scene.anchors import native_decode, triton_decode
+from scene_experts.scene.anchors import native_decode
 from scene_experts.scene.anchors import scene as anchors
 from scene_experts.scene.anchors.balance import Balanced
 from scene_experts.scene.anchors.experts import Experts
@@ -16,7 +16,7 @@ from scene_experts.scene.anchors.frozen import Frozen, FrozenCuda
 from scene_experts.scene.anchors.routers import Linear, Margin
 from scene_experts.scene.anchors.scene import Anchors, AnchorScene
 from scene_experts.training.recipes import RECIPES
-from support.interpret import DEVICE, kernels
+from support.interpret import DEVICE, decode_by_triton, kernels
 from support.messages import naming
 
 needs_native = pytest.mark.skipif(native.load() is None, reason="no compiled library")
@@ -109,7 +109,7 @@ def test_on_cuda_appearance_codes_are_folded_before_the_routing():
 )
 def test_on_cuda_the_same_bits_are_drawn(config, monkeypatch):
     kernels()
-    monkeypatch.setattr(native_decode, "decode", triton_decode.decode)  # what a scene on CUDA calls, here also for one in the interpreter
+    monkeypatch.setattr(native_decode, "decode", decode_by_triton)  # what a scene on CUDA calls, here also for one in the interpreter
     monkeypatch.setattr(anchors, "no_kernels", lambda device: None)
     scene = trained(config, n=60).to(DEVICE)
     view = camera(1).to(DEVICE)

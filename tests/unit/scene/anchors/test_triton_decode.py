@@ -15,7 +15,7 @@ from scene_experts.scene.anchors.mlp import NOT_ROUTED, Plain
 from scene_experts.scene.anchors.routers import Linear
 from scene_experts.scene.anchors.scene import Anchors, AnchorScene
 from support.decoding import CASES, EXTENT, OUTSIDE, compare, leaves, objective, oracle, problem, single_precision, without_routers
-from support.interpret import DEVICE, kernels
+from support.interpret import DEVICE, decode_by_triton, kernels
 from support.messages import naming
 
 SMALL = {
@@ -229,7 +229,7 @@ SCENES = {
 @pytest.mark.usefixtures("triton")
 @pytest.mark.parametrize("name", SCENES)
 def test_a_scene_s_two_decodes_agree(name, monkeypatch):
-    monkeypatch.setattr(native_decode, "decode", triton_decode.decode)  # what a scene on CUDA calls, here for one in the interpreter
+    monkeypatch.setattr(native_decode, "decode", decode_by_triton)  # what a scene on CUDA calls, here for one in the interpreter
     monkeypatch.setattr(anchors, "no_kernels", lambda device: None)
     made = scene(SCENES[name], 50).to(DEVICE)
     camera, rows = CAMERA.to(DEVICE), torch.arange(0, 50, 2, device=DEVICE)
