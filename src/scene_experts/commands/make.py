@@ -53,7 +53,11 @@ def make(args: list[str]) -> int:
     times = ", ".join(f"{name} {format_duration(took)}" for name, took in made.seconds.items() if took >= 1)
     say(f"time: {times}" if times else "everything was there already")
     if made.psnr is not None:
-        held = "photographs held out" if command.scores else "the photographs that were trained on (what lies between them is not scored)"
+        held = (
+            "photographs held out (the report has each; a mean of few says little)"
+            if command.scores
+            else "the photographs that were trained on (what lies between them is not scored)"
+        )
         say(f"PSNR: {made.psnr:.2f} dB on {held}")
     if made.report is not None:
         say(f"report: {made.report}")

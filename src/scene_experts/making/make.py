@@ -159,7 +159,7 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
                 f"expected a run with the same photographs held out in {folder}, found one where {told}; "
                 f"{'leave --scores out' if scores else 'add --scores'}, or choose another --out"
             )
-        say(f"training: continues that in {folder}")
+        say(f"training: continues that in {folder}; to train anew, with other minutes, remove that folder")
         capture = load_capture(place, split=split, resolution=begun.data.resolution, seed=begun.train.seed)
         return TrainingPlan(place, split, (0, 0), capture, begun.train, begun=True)
     whole = load_capture(place, split=split)
@@ -168,7 +168,8 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
     plan = first.fit(budget.for_training(scores))
     held = f", {len(whole.test_cameras)} held out" if scores else ""
     about = "" if plan.minutes is None else f", about {max(1, round(plan.minutes))} min if the machine is not busy"
-    say(f"training: {plan.recipe.recipe}, {plan.recipe.iterations:,} iterations on {len(whole.train_cameras)} photographs{held}{about}")
+    what = f"{plan.recipe.iterations:,} iterations, {plan.capture.data.resolution}, {len(whole.train_cameras)} photographs"
+    say(f"training: {plan.recipe.recipe}, {what}{held}{about}")
     return plan
 
 
