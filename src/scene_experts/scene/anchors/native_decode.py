@@ -64,7 +64,8 @@ def decode(
     """Decode anchors into Gaussians.
 
     Differentiable with respect to feature, log_scaling, offsets, the tensors of the heads, the
-    weights in `outside` and the steps, but not xyz and the camera. All tensors are float32 on the CPU unless
+    weights in `outside` and the steps, but not xyz and the camera. All tensors are float32 on the
+    CPU unless
     noted.
 
     Args:
