@@ -141,7 +141,9 @@ def check(cfg: Train) -> None:
     if cfg.rates.family != cfg.scene.family:
         raise InputError(f"expected learning rates for {cfg.scene.family}, found those for {cfg.rates.family}; use a recipe where they fit")
     if cfg.rate and not cfg.scene.can_round:
-        raise InputError(f"expected a recipe of anchors for --rate, found one of {cfg.scene.grown_as}; choose one of those, or leave it out")
+        raise InputError(
+            f"expected a recipe of anchors for --rate, found one of {cfg.scene.grown_as}; choose one of those, or leave it out"
+        )
     if cfg.sparse_adam and not cfg.optimizer.by_row:
         raise InputError("expected an optimiser that can move some rows only for --sparse-adam, found another; leave the flag out")
 

@@ -65,8 +65,7 @@ def decode(
 
     Differentiable with respect to feature, log_scaling, offsets, the tensors of the heads, the
     weights in `outside` and the steps, but not xyz and the camera. All tensors are float32 on the
-    CPU unless
-    noted.
+    CPU unless noted.
 
     Args:
         rows: [A] int64, without duplicates.

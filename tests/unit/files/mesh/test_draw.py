@@ -5,11 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from scene_experts.cli import main
 from scene_experts.core.errors import InputError
 from scene_experts.files.export import Options, export
 from scene_experts.files.mesh.draw import MeshTask, draw_views, make_mesh
+from scene_experts.files.mesh.fuse import sample
 from scene_experts.training import run_folder
 from support.synthetic import make_capture
 
@@ -36,9 +38,7 @@ def test_the_mesh_lies_where_the_views_see_it(run):
     mesh, note = make_mesh(task)
     assert len(mesh) > 50 and len(mesh.vertices) == len(mesh.colors) and note["cells"] == 40 and note["views"] == len(capture.train)
     view = draw_views(task)[0]
-    places = capture.world.from_input(__import__("torch").from_numpy(mesh.vertices)).numpy()
-    from scene_experts.files.mesh.fuse import sample
-
+    places = capture.world.from_input(torch.from_numpy(mesh.vertices)).numpy()
     at, seen = sample(view, places)
     z = places @ view.camera.world_to_cam.double().numpy()[2, :3] + float(view.camera.world_to_cam[2, 3])
     assert seen.any() and np.median(np.abs(at - z)[seen]) < 3 * note["voxel"] * capture.world.scale
