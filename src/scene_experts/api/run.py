@@ -36,7 +36,7 @@ from scene_experts.training import run_folder, state
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.training.state import Training
 from scene_experts.view import video
-from scene_experts.view.paint import Look, paint
+from scene_experts.view.paint import Look, measure_depth, paint
 from scene_experts.view.show import SHOWS, Show
 
 
@@ -180,8 +180,7 @@ class Run:
         view, background = self._view(camera)
         decoded = self._frozen()(view, self.step, types.Mode.DRAW, self._rasterize.visible)
         drawn = self._rasterize(decoded.gaussians, view, background)
-        seen = drawn.alpha > 0
-        depth = torch.where(seen, drawn.depth / drawn.alpha.clamp_min(1e-12), 0.0) / self.capture.loaded.world.scale
+        depth = measure_depth(drawn) / self.capture.loaded.world.scale
         return Layers(numpy(drawn.image.clamp(0, 1)), numpy(depth), numpy(drawn.alpha.clamp(0, 1)))
 
     def write_video(

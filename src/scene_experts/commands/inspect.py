@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from scene_experts.arguments.parse import Command, parse
 from scene_experts.commands import PROG
+from scene_experts.core.errors import InputError
 from scene_experts.data.fetch.catalog import defaults_in
 from scene_experts.data.settings import Data
 
 
 def info(args: list[str]) -> int:
-    about = "Show what a capture contains: views, picture sizes, cameras, points, split and warnings."
+    about = (
+        "Show what a capture contains: views, picture sizes, cameras, points, split and warnings; "
+        "or, for a run folder, its recipe, size, scores and files."
+    )
     brought = {"normalise": defaults_in(args).normalise}
     data = parse(Data, Command(f"{PROG} info", ("data",), about=about, defaults=brought), args)
 
@@ -23,11 +28,25 @@ def info(args: list[str]) -> int:
     from scene_experts.training import run_folder
 
     console = Console(markup=False, highlight=False)
+    if is_run(data.path):
+        from scene_experts.commands.run_facts import print_run
+
+        if given := [word for word in args if word.startswith("-") and word not in ("-s", "--data")]:
+            raise InputError(f"expected no {given[0]} with a run folder, found {data.path}; leave it out, or give a capture")
+        print_run(data.path, console)
+        return 0
     capture = captures.load(run_folder.named(data), allow_no_points=True)
     print_summary(capture, console)
     lens = capture.images.sources[0].lens
     console.print(propose_training(data, lens.width, lens.height, len(capture.views)), markup=False, soft_wrap=True)
     return 0
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder is a run folder and no capture."""
+    from scene_experts.data.readers import is_capture
+
+    return (folder / "config.json").is_file() and (folder / "checkpoints").is_dir() and not is_capture(folder)
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,9 @@ class RenderCommand:
     run: Annotated[Path, Option(value="RUN")]
     """Run folder."""
     out: Path | None = None
-    """Video to write (.mp4, .mov, .mkv or .webm), or a folder for PNG files; by default
-    RUN/renders/NAME.mp4 with the path's name."""
+    """Video to write (.mp4, .mov, .mkv or .webm), or a folder for PNG files, with --show depth also
+    for TIFF files of depths (float32, the capture's unit); by default RUN/renders/NAME.mp4 with the
+    path's name."""
     options: Annotated[FilmOptions, Option(name="")] = FilmOptions()
     beside: Annotated[tuple[Path, ...], Option(value="RUN")] = ()
     """Other runs of the same capture to show side by side."""

@@ -248,5 +248,8 @@ def follow(command: TrainCommand, run: Job, capture: Capture, rasterize: Rasteri
     if exported:
         console.print(f"next: {shlex.join([PROG, 'eval', str(command.out)])}", soft_wrap=True)
     else:
-        console.print("the training was already complete; the files of the run are unchanged", soft_wrap=True)
+        asked, whole = command.options.stop_at or 0, command.cfg.iterations
+        longer = f"; --stop-at {asked:,} is beyond the {whole:,} iterations of its schedule" if asked > whole else ""
+        go_on = f"; for more, train into another --out with --init-from {command.out} and more --iterations"
+        console.print(f"the training was already complete; the files of the run are unchanged{longer}{go_on}", soft_wrap=True)
     return 0

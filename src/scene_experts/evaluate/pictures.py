@@ -87,6 +87,11 @@ def write_picture(path: Path, pixels: np.ndarray, sync: bool = True) -> None:
     write_atomic(path, lambda temporary: Image.fromarray(pixels).save(temporary, format="PNG", compress_level=1), sync)
 
 
+def write_floats(path: Path, values: np.ndarray) -> None:
+    """Write float32 values [H, W] as a TIFF file of 32-bit floats, atomically."""
+    write_atomic(path, lambda temporary: Image.fromarray(values).save(temporary, format="TIFF"))
+
+
 class Writer:
     """Context manager that draws, encodes and writes pictures in threads, at most PENDING views
     ahead. Raises what a thread raised, at a later call or at the end."""

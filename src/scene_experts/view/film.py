@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.progress import Progress
-from scene_experts.core.types import Camera
+from scene_experts.core.types import Camera, Mode
 from scene_experts.data.capture import Capture
 from scene_experts.data.views import same_poses
 from scene_experts.evaluate.pictures import join_pictures, to_8bit
@@ -19,7 +20,7 @@ from scene_experts.render import Rasterizer, as_trained
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.view import path_files, paths, video
 from scene_experts.view.film_options import FilmOptions
-from scene_experts.view.paint import Look, paint
+from scene_experts.view.paint import Look, measure_depth, paint
 from scene_experts.view.paths import CameraPath
 
 
@@ -33,13 +34,16 @@ class Film:
     path: CameraPath
 
     def write(self, out: Path, rasterize: Rasterizer, device: str, progress: Progress) -> int:
-        """Write a video, or PNG files if `out` is a folder, and return the number of frames.
+        """Write a video, or PNG files if `out` is a folder, and return the number of frames. A folder
+        that shows depth has the first run's as float32 too: along the camera's axis, in the
+        capture's unit, 0 where nothing is drawn.
 
         Raises InputError if a video is impossible, RunError if the encoder fails or the disk is
         full.
         """
         if not video.is_video(out):
-            return video.write_pictures(out, self.draw_frames(rasterize, device, progress))
+            depths = partial(self.draw_depth, rasterize, device) if "depth" in self.options.show else None
+            return video.write_pictures(out, self.draw_frames(rasterize, device, progress), depths)
         video.import_ffmpeg()  # reports a missing package before the first frame is drawn
         self.expect_one_size()
         return video.write_video(out, self.draw_frames(rasterize, device, progress), self.path.fps, self.options.quality)
@@ -63,6 +67,15 @@ class Film:
                 tiles += [paint(run.scene, camera, run.step, draw, background, look, draws) for look in looks]
             yield to_8bit(join_pictures(tiles) if len(tiles) > 1 else tiles[0])
             progress("rendering", i + 1, len(self.path.cameras))
+
+    @torch.no_grad()
+    def draw_depth(self, rasterize: Rasterizer, device: str, frame: int) -> np.ndarray:
+        """Return the depth [H, W] of the first run in a frame, float32, see `write`."""
+        run, camera = self.runs[0], self.path.cameras[frame].to(device)
+        draw = as_trained(rasterize, run.config.train.antialias)
+        decoded = run.scene(camera, run.step, Mode.DRAW, draw.visible)
+        drawn = draw(decoded.gaussians, camera, torch.tensor(self.capture.background, device=device))
+        return (measure_depth(drawn) / self.capture.world.scale).cpu().numpy()
 
     def expect_one_size(self) -> None:
         """Raise InputError for cameras of several sizes. A video has one size."""

@@ -99,6 +99,11 @@ def to_picture(render: Render, show: Show) -> Tensor:
     return render.image.clamp(0, 1)
 
 
+def measure_depth(render: Render) -> Tensor:
+    """Return the mean depth of what is drawn, [H, W], trained units; 0 where nothing is drawn."""
+    return torch.where(render.alpha > 0, render.depth / render.alpha.clamp_min(1e-12), 0.0)
+
+
 def color_rows(decoded: Decoded, look: Look) -> Tensor:
     """Return a colour in [0, 1] for each decoded row, [A, 3]."""
     if look.show == "activation":

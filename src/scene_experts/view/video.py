@@ -3,7 +3,7 @@ installs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -75,35 +75,45 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float, quality: i
     return count
 
 
-def write_pictures(folder: Path, frames: Iterable[np.ndarray]) -> int:
+def write_pictures(folder: Path, frames: Iterable[np.ndarray], floats: Callable[[int], np.ndarray] | None = None) -> int:
     """Write frames as 00000.png, 00001.png, ... and their number as frames.json, and return their
-    number.
+    number. floats: Returns values [H, W] of a frame, which are written as 00000.tiff.
 
     Frames that an earlier call wrote into the folder are replaced. Raises InputError, before the
     first frame is drawn, if the folder holds such pictures from elsewhere.
     """
     if folder.exists() and not folder.is_dir():
         raise InputError(f"expected a folder for pictures, found the file {folder}; choose another --out")
-    earlier, note = [folder / f"{i:05d}.png" for i in range(_count_earlier(folder))], folder / NOTE
-    foreign = set(folder.glob("[0-9][0-9][0-9][0-9][0-9].png")) - set(earlier)
-    if foreign:
-        raise InputError(f"{folder} holds {min(foreign).name}, which `render` did not write; choose another --out")
+    before, had_floats = _read_earlier(folder)
+    earlier, note = [f"{i:05d}" for i in range(before)], folder / NOTE
+    for suffix, known in ((".png", earlier), (".tiff", earlier if had_floats else [])):
+        foreign = {path.stem for path in folder.glob(f"[0-9][0-9][0-9][0-9][0-9]{suffix}")} - set(known)
+        if foreign and (suffix == ".png" or floats is not None):
+            raise InputError(f"{folder} holds {min(foreign)}{suffix}, which `render` did not write; choose another --out")
     count = 0
     for count, frame in enumerate(frames, 1):
-        if count > len(earlier):
-            write_json(note, {"frames": count})  # first, because a picture without a note counts as foreign
+        if count > before or (floats is not None and not had_floats):
+            # first, because a picture without a note counts as foreign
+            write_json(note, {"frames": max(count, before), "floats": had_floats or floats is not None})
         pictures.write_picture(folder / f"{count - 1:05d}.png", frame)
-    for old in earlier[count:]:
-        old.unlink(missing_ok=True)
-    write_json(note, {"frames": count})
+        if floats is not None:
+            pictures.write_floats(folder / f"{count - 1:05d}.tiff", floats(count - 1))
+    for number, name in enumerate(earlier):
+        if number >= count:
+            (folder / f"{name}.png").unlink(missing_ok=True)
+        if had_floats and (number >= count or floats is None):
+            (folder / f"{name}.tiff").unlink(missing_ok=True)
+    write_json(note, {"frames": count, "floats": floats is not None})
     return count
 
 
-def _count_earlier(folder: Path) -> int:
-    """Return the number of pictures that an earlier call wrote into `folder`."""
+def _read_earlier(folder: Path) -> tuple[int, bool]:
+    """Return the number of pictures that an earlier call wrote into `folder`, and whether it wrote
+    files of floats too."""
     try:
         found = read_json(folder / NOTE, "note of the frames")
     except InputError:
-        return 0
+        return 0, False
     count = found.get("frames") if isinstance(found, dict) else None
-    return count if isinstance(count, int) and 0 <= count < 100_000 else 0
+    floats = isinstance(found, dict) and found.get("floats") is True
+    return (count, floats) if isinstance(count, int) and 0 <= count < 100_000 else (0, False)

@@ -3,8 +3,11 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
+from PIL import Image
 
+import scene_experts as se
 from scene_experts import cli
 from scene_experts.core.errors import InputError
 from scene_experts.evaluate import pictures
@@ -43,6 +46,16 @@ def test_views_of_several_sizes_are_no_video(run, tmp_path):
     assert len({pictures.read_picture(path).shape for path in (tmp_path / "frames").glob("*.png")}) == 2
     assert cli.main([*args, str(tmp_path / "x.mp4")]) == 2 and not (tmp_path / "x.mp4").exists()
     assert cli.main([*args, str(tmp_path / "x.mp4"), "--size", "48x32"]) == 0 and (tmp_path / "x.mp4").stat().st_size > 0
+
+
+def test_depth_in_a_folder_is_that_of_the_layers(run, tmp_path):
+    args = ["render", str(run), "--path", "test", "--show", "depth", "--out", str(tmp_path)]
+    assert cli.main(args) == 0
+    opened = se.open_run(run)
+    layers = opened.render_layers(opened.test_cameras[0])
+    with Image.open(tmp_path / "00000.tiff") as found:
+        assert np.allclose(np.array(found), layers.depth, rtol=1e-5)
+    assert layers.depth.max() > 0
 
 
 def test_the_held_out_views_beside_another_run(run, tmp_path):

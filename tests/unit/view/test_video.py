@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.evaluate import pictures
@@ -39,6 +40,22 @@ def test_foreign_numbered_pictures_are_not_replaced(tmp_path):
     (tmp_path / "frames.json").write_text("{")
     with pytest.raises(InputError, match=naming("00000.png")):
         video.write_pictures(tmp_path, frames())
+
+
+def test_floats_lie_beside_the_pictures_and_go_with_them(tmp_path):
+    depth = lambda frame: np.full((4, 5), 2.5 + frame, np.float32)  # noqa: E731
+    video.write_pictures(tmp_path, frames(3), depth)
+    with Image.open(tmp_path / "00002.tiff") as found:
+        assert found.mode == "F" and np.array_equal(np.array(found), depth(2))
+    video.write_pictures(tmp_path, frames(2), depth)
+    assert sorted(path.name for path in tmp_path.glob("*.tiff")) == ["00000.tiff", "00001.tiff"]
+    video.write_pictures(tmp_path, frames(2))
+    assert not list(tmp_path.glob("*.tiff"))
+    (tmp_path / "00001.tiff").write_bytes(b"a scan")
+    video.write_pictures(tmp_path, frames(1))
+    assert (tmp_path / "00001.tiff").read_bytes() == b"a scan"
+    with pytest.raises(InputError, match=naming("00001.tiff")):
+        video.write_pictures(tmp_path, frames(1), depth)
 
 
 def test_pictures_of_an_interrupted_path_are_replaced(tmp_path):
