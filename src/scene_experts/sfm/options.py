@@ -32,6 +32,12 @@ class SfmOptions:
     mapper: Mapper = "auto"
     """COLMAP's incremental mapper or the global mapper (GLOMAP). auto: incremental; if more than a
     tenth of the photographs get no pose, both are run and the better result is kept."""
+    panoramas: Literal["cut", "keep"] = "cut"
+    """360 degree panoramas (by their XMP data, or 2:1 with edges that meet): cut twelve views of 90
+    degrees out of each, whose poses are tied together, or keep them as perspective pictures."""
+    nadir: Annotated[float, Range(0, 60)] = 0.0
+    """Degrees around straight down that masks leave out of panoramas, for who or what carries the
+    camera."""
     max_side: Annotated[int, Range(64, LARGEST)] = 1600
     """Longest side in pixels at which features are extracted. The photographs themselves are not
     changed."""

@@ -3,6 +3,8 @@ pairs of 128 photographs more than an hour."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 
@@ -39,16 +41,23 @@ def follow(count: int, steps: list[int]) -> list[tuple[int, int]]:
     return [(i, i + step) for i in range(count) for step in steps if i + step < count]
 
 
-def find_alike(database: Path, names: list[str]) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+def find_alike(database: Path, names: list[str], places: Sequence[str] = ()) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Return the pairs of photographs that are matched, and more pairs for those that fit too few
     others.
 
-    Each photograph is matched with the ALIKE that look most like it, with the FOLLOWING next ones
+    places: Where each was taken, by any name: photographs of one place, such as the views of a
+    panorama, are not matched. Each photograph is matched with the ALIKE that look most like it, with the FOLLOWING next ones
     and with the NEAR that were taken nearest to it, where their cameras noted the places.
     """
-    ranks = rank_alike(describe_photos(database, names), ALIKE + SPARE)
+    at = list(places) or [str(i) for i in range(len(names))]
+    most = max(Counter(at).values()) - 1  # others of one place
+    ranks = [
+        [int(j) for j in row if at[int(j)] != at[i]][: ALIKE + SPARE]
+        for i, row in enumerate(rank_alike(describe_photos(database, names), ALIKE + SPARE + most))
+    ]
     ordered = lambda i, j: (min(i, j), max(i, j))  # noqa: E731
-    near = {ordered(i, int(j)) for i, row in enumerate(ranks) for j in row[:ALIKE]}
+    near = {ordered(i, j) for i, row in enumerate(ranks) for j in row[:ALIKE]}
     near |= {*follow(len(names), [*range(1, FOLLOWING + 1)]), *find_near(read_positions(database, names), NEAR)}
-    more = {ordered(i, int(j)) for i, row in enumerate(ranks) for j in row[ALIKE:]}
+    near = {(i, j) for i, j in near if at[i] != at[j]}
+    more = {ordered(i, j) for i, row in enumerate(ranks) for j in row[ALIKE:]}
     return sorted(near), sorted(more - near)

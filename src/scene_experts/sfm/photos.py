@@ -6,11 +6,12 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
+import numpy as np
 from PIL import Image, ImageOps
 
 from scene_experts.core.errors import InputError, few
@@ -20,6 +21,7 @@ from scene_experts.core.reading.budget import CAPTURED
 from scene_experts.core.reading.deep_colors import COLOR16, describe_mode
 from scene_experts.core.reading.pictures import opening_picture
 from scene_experts.data.colour import White, find_white, is_deep, lift, to_8_bit
+from scene_experts.data.equirectangular import is_seamless
 from scene_experts.data.masks import Found, Mask, find_masks, may_be_mask, read_mask
 from scene_experts.data.match import EXTENSIONS
 
@@ -27,14 +29,10 @@ FEWEST = 3  # photographs needed for a reconstruction
 UNSUPPORTED = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".hdr")  # photographs that Pillow does not read
 HEIC = (".heic", ".heif")  # read with pillow-heif, if it is installed
 COLMAP_FORMATS = ("JPEG", "MPO", "PNG", "BMP", "TIFF")  # what COLMAP reads
-PANORAMA = (
-    "which are taken as perspective pictures here: cut views of 90 degrees out of each first, for example by "
-    "ffmpeg -i PANORAMA -vf v360=e:flat:yaw=0:h_fov=90:v_fov=90:w=1200:h=1200 VIEW.jpg with yaw 0, 45, 90, ..."
-)
 _SMALLEST_ROUND = 2000  # px; width of a panorama
 _LONGEST_FACT = 256  # characters of what EXIF says about a camera
 COPIED = "copied.json"
-_MAKE, _MODEL, _ORIENTATION, _EXIF, _FOCAL, _LENS = 0x010F, 0x0110, 0x0112, 0x8769, 0x920A, 0xA434
+_MAKE, _MODEL, ORIENTATION, _EXIF, _FOCAL, _LENS = 0x010F, 0x0110, 0x0112, 0x8769, 0x920A, 0xA434
 
 
 @dataclass(frozen=True)
@@ -50,7 +48,7 @@ class Photo:
     mask: Mask | None = None
     mode: str = "RGB"  # of `describe_mode`
     white: White = White()  # of deep photographs
-    round: bool = False  # a 360 degree panorama, by its XMP data or by a shape of 2:1
+    round: bool = False  # a 360 degree panorama, by its XMP data or by its shape and edges
 
     @property
     def stored(self) -> str:
@@ -92,9 +90,7 @@ def find_photos(folder: Path, exclude: Path | None = None, say: Callable[[str], 
         raise InputError(f"expected at least {FEWEST} photographs ({', '.join(EXTENSIONS)}) in {folder}, found {len(names)}; {advice}")
     for line in describe_rest(found, names, sorted(set(files) - set(paths)), folder):
         say(line)
-    photos = inspect_photos(folder, names, found)
-    if turned := [photo.name for photo in photos if photo.round]:
-        say(f"warning: {len(turned)} photographs look like 360 degree panoramas ({few(turned)}), {PANORAMA}")
+    photos = decide_round(inspect_photos(folder, names, found))
     white, notes = find_white([(folder / photo.name, photo.mode) for photo in photos])
     for line in notes:
         say(f"warning: {line}")
@@ -112,6 +108,16 @@ def find_photos(folder: Path, exclude: Path | None = None, say: Callable[[str], 
                 f"expected names in {folder} that differ not only in blanks or extension, found '{one.name}' and '{other.name}'; rename one"
             )
     return photos
+
+
+def decide_round(photos: list[Photo]) -> list[Photo]:
+    """Return the photographs where those of one size and camera are all panoramas, or none is: what
+    at least half of them look like."""
+    alike: dict[object, list[Photo]] = {}
+    for photo in photos:
+        alike.setdefault((photo.size, photo.camera), []).append(photo)
+    turned = {key for key, group in alike.items() if 2 * sum(photo.round for photo in group) >= len(group)}
+    return [replace(photo, round=(photo.size, photo.camera) in turned) for photo in photos]
 
 
 def describe_rest(found: Found, names: Sequence[str], others: Sequence[Path], folder: Path) -> list[str]:
@@ -201,9 +207,10 @@ def inspect_photo(folder: Path, name: str, mask: Mask | None) -> Photo:
         inner = exif.get_ifd(_EXIF)
         image.draft(None, (max(1, size[0] // 8), max(1, size[1] // 8)))
         image.load()
+        round = round or (size[0] == 2 * size[1] and size[0] >= _SMALLEST_ROUND and is_seamless(np.asarray(image.convert("RGB"))))
         facts = (exif.get(_MAKE), exif.get(_MODEL), inner.get(_LENS), inner.get(_FOCAL))
         camera = tuple(str(value).strip()[:_LONGEST_FACT] for value in facts) if any(facts) else ()
-        orientation = exif.get(_ORIENTATION, 1)
+        orientation = exif.get(ORIENTATION, 1)
     return Photo(
         name,
         size,
@@ -213,7 +220,7 @@ def inspect_photo(folder: Path, name: str, mask: Mask | None) -> Photo:
         file_stamp(path) + ((*file_stamp(mask.path), mask.labels, mask.inverted) if mask else ()),
         mask,
         mode,
-        round=round or (size[0] == 2 * size[1] and size[0] >= _SMALLEST_ROUND),
+        round=round,
     )
 
 
@@ -239,9 +246,9 @@ def check_in_place(photos: Sequence[Photo], folder: Path) -> list[Photo]:
     return list(photos)
 
 
-def copy_photos(photos: Sequence[Photo], source: Path, target: Path) -> list[Photo]:
+def copy_photos(photos: Sequence[Photo], source: Path, target: Path, keep: Collection[str] = ()) -> list[Photo]:
     """Copy photographs and their masks into `target` under their stored names and return them.
-    Other files in `target` are removed.
+    Other files in `target` are removed, but for those in its folders `keep`.
 
     Photographs that EXIF rotates are written upright at high quality: COLMAP uses the stored
     pixels, and a scene of sideways photographs would lie on its side. Existing copies are kept.
@@ -251,7 +258,8 @@ def copy_photos(photos: Sequence[Photo], source: Path, target: Path) -> list[Pho
     wanted = {photo.stored: photo for photo in photos}
     masks = {photo.stored: target / f"{PurePosixPath(photo.stored).with_suffix('')}_mask.png" for photo in photos if photo.mask}
     for path in [path for path in target.rglob("*") if path.is_file()]:
-        if path.relative_to(target).as_posix() not in wanted and path not in masks.values():
+        name = path.relative_to(target)
+        if name.as_posix() not in wanted and path not in masks.values() and name.parts[0] not in keep:
             path.unlink()
     for name, photo in wanted.items():
         new = target / name
@@ -267,7 +275,7 @@ def copy_photos(photos: Sequence[Photo], source: Path, target: Path) -> list[Pho
 def copy_mask(photo: Photo, new: Path) -> None:
     """Write the mask of `photo` upright, 255 where pixels count."""
     mask = read_stored_mask(photo)
-    mask.getexif()[_ORIENTATION] = photo.orientation
+    mask.getexif()[ORIENTATION] = photo.orientation
     upright = ImageOps.exif_transpose(mask)
     upright.getexif().clear()
     write_atomic(new, lambda temporary: upright.save(temporary, "PNG"))
@@ -282,7 +290,7 @@ def read_stored_mask(photo: Photo) -> Image.Image:
     assert photo.mask is not None
     mask, (width, height) = read_mask(photo.mask), photo.size
     if photo.orientation in (5, 6, 7, 8) and (mask.width > mask.height) != (width > height):
-        mask.getexif()[_ORIENTATION] = {6: 8, 8: 6}.get(photo.orientation, photo.orientation)
+        mask.getexif()[ORIENTATION] = {6: 8, 8: 6}.get(photo.orientation, photo.orientation)
         mask = ImageOps.exif_transpose(mask)
     return mask
 
@@ -297,7 +305,7 @@ def transfer(old: Path, new: Path, orientation: int, suffix: str = "", white: Wh
     with opening_picture(old, CAPTURED, heic=True) as image:
         form = {".jpg": "JPEG", ".png": "PNG"}.get(suffix) or ("JPEG" if image.format == "MPO" else image.format)
         image = image if white is None else lift(image, white)
-        image.getexif()[_ORIENTATION] = orientation
+        image.getexif()[ORIENTATION] = orientation
         upright = ImageOps.exif_transpose(image)
         exif, upright = upright.getexif(), to_8_bit(upright, white) if is_deep(upright.mode) else upright
         profile = None if is_deep(image.mode) else image.info.get("icc_profile")

@@ -21,6 +21,7 @@ from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.extras import install_line
 from scene_experts.core.io import read_json, write_bytes, write_json
 from scene_experts.core.progress import Progress
+from scene_experts.data.equirectangular import FIELD, VIEWS
 from scene_experts.data.match import EXTENSIONS
 from scene_experts.data.readers import is_capture
 from scene_experts.native import library as native
@@ -28,9 +29,10 @@ from scene_experts.sfm import frames, photos, work, worker
 from scene_experts.sfm.masks import write_masks
 from scene_experts.sfm.options import SfmOptions
 from scene_experts.sfm.pairs import choose_pairs, find_alike
+from scene_experts.sfm.panoramas import FOLDERS, PanoramaRig, cut_panoramas, find_place
 from scene_experts.sfm.photos import Photo
 
-LOG, NOTE, VIDEO = "colmap.log", "capture.json", "video.txt"
+LOG, NOTE, VIDEO, FRAMES = "colmap.log", "capture.json", "video.txt", "frames"
 
 Say = Callable[[str], None]
 
@@ -65,15 +67,20 @@ def reconstruct(
         images = out / "images" if own else folder / work.DONE / "images"
         if source.is_file():
             say(f"reading {source.name}: the sharpest of its frames are used")
-            found = extract_photos(source, images, options, progress)
-        elif own:
-            found = photos.check_in_place(found, source)
+            place = folder / FRAMES if (folder / FRAMES).is_dir() else images
+            found = extract_photos(source, place, options, progress)
+            if place == images and cuts(found, options):  # the frames are not the photographs of the capture
+                move_frames(images, folder / FRAMES)
+                place = folder / FRAMES
         else:
+            place = source
             (folder / work.DONE / VIDEO).unlink(missing_ok=True)  # the images are no longer its frames
-            found = photos.copy_photos(found, source, images)
+        found, rig = take_photos(found, place, images, options, say)
         groups = photos.group_by_camera(found)
         names = [photo.name for photo in found]
         pairs = choose_pairs(len(names), options.matching)
+        if pairs is not None and rig is not None:
+            pairs = [(i, j) for i, j in pairs if find_place(names[i]) != find_place(names[j])]
         kind = "frames" if source.is_file() else "photographs"
         said = f"{len(found)} {kind}, {len(groups)} camera{'s' if len(groups) > 1 else ''}"
         every = len(names) * (len(names) - 1) // 2
@@ -87,6 +94,7 @@ def reconstruct(
             "maps": str(folder / "maps"),
             "model": str(folder / work.DONE / "model"),
             "groups": groups,
+            "rig": None if rig is None else rig.plain(),
             "pairs": None if pairs is None else [(names[i], names[j]) for i, j in pairs],
             "spare": [],
             "threads": options.threads or native.count_cores(),
@@ -98,7 +106,7 @@ def reconstruct(
         began = time.monotonic()
         if pairs is None:  # the features decide
             run_worker(request, folder / LOG, say, progress)
-            pairs, spare = find_alike(Path(request["database"]), names)
+            pairs, spare = find_alike(Path(request["database"]), names, [find_place(name) for name in names])
             say(f"{len(pairs):,} of {every:,} pairs to match: photographs that look alike, and each with those that follow it")
             asked = {"pairs": pairs, "spare": spare}
             request = {**request, **{name: [(names[i], names[j]) for i, j in some] for name, some in asked.items()}}
@@ -113,6 +121,40 @@ def reconstruct(
         work.publish(out)
     shutil.rmtree(out / work.NAME, ignore_errors=True)
     return note
+
+
+def cuts(found: list[Photo], options: SfmOptions) -> bool:
+    """Return whether views are cut out of some of the photographs."""
+    return options.panoramas == "cut" and any(photo.round for photo in found)
+
+
+def take_photos(found: list[Photo], source: Path, images: Path, options: SfmOptions, say: Say) -> tuple[list[Photo], PanoramaRig | None]:
+    """Copy the photographs of the folder `source` into the folder `images` of a capture, unless they
+    lie there, and cut panoramas into views. Returns what lies there, and the rig of the views."""
+    turned = [photo for photo in found if photo.round]
+    flat = f"warning: {len(turned)} photographs look like 360 degree panoramas and are taken as perspective pictures"
+    if source.resolve() == images.resolve():
+        if turned and options.panoramas == "cut":
+            say(f"{flat}, because they lie in the capture; copy them into another folder and give that one")
+        return photos.check_in_place(found, source), None
+    if not cuts(found, options):
+        if turned:
+            say(flat)
+        return photos.copy_photos(found, source, images), None
+    plain = [photo for photo in found if not photo.round]
+    copied = photos.copy_photos(plain, source, images, FOLDERS) if plain else []
+    views, rig = cut_panoramas(turned, source, images, options.nadir)
+    made = f"{len(VIEWS)} views of {FIELD:g} degrees and {rig.side} px are cut out of each"
+    below = f", without {options.nadir:g} degrees around straight down" if options.nadir else ""
+    instead = "--panoramas keep takes them as perspective pictures"
+    say(f"{len(turned)} of {len(found)} photographs are 360 degree panoramas: {made}{below} ({instead})")
+    return [*copied, *views], rig
+
+
+def move_frames(images: Path, frames: Path) -> None:
+    """Move the frames of a video, and the note about them, out of the capture that is made."""
+    os.replace(images, frames)
+    os.replace(images.with_name(VIDEO), frames.with_name(VIDEO))
 
 
 def check_request(source: Path, out: Path, overwrite: bool) -> None:

@@ -43,6 +43,9 @@ def extract_features(colmap: Any, ask: dict[str, Any]) -> None:
             some, missing = missing[:CHUNK], missing[CHUNK:]
             reader = colmap.ImageReaderOptions()
             reader.camera_model = ask["camera_model"]
+            if is_cut(names[0], ask):
+                reader.camera_model = ask["rig"]["model"]
+                reader.camera_params = ", ".join(map(repr, ask["rig"]["params"]))
             if ask["masks"]:
                 reader.mask_path = ask["masks"]
             if camera is not None:
@@ -68,6 +71,28 @@ def read_done(colmap: Any, database: str, names: list[str]) -> tuple[int | None,
         have = {name: images[name] for name in names if name in images and there.exists_descriptors(images[name].image_id)}
     camera = next((image.camera_id for image in have.values()), None)
     return camera, [name for name in names if name not in have]
+
+
+def is_cut(name: str, ask: dict[str, Any]) -> bool:
+    """Return whether a photograph is a view that was cut out of a panorama."""
+    return ask["rig"] is not None and name.split("/")[0] in ask["rig"]["views"]
+
+
+def tie_views(colmap: Any, ask: dict[str, Any]) -> None:
+    """Tell COLMAP that the views of a panorama were seen from one place, and how they are turned."""
+    cameras = []
+    for folder, rotation in ask["rig"]["views"].items():
+        camera = colmap.RigConfigCamera()
+        camera.image_prefix, camera.ref_sensor = f"{folder}/", not cameras
+        if cameras:
+            first = next(iter(ask["rig"]["views"].values()))
+            turn = [[sum(rotation[i][k] * first[j][k] for k in range(3)) for j in range(3)] for i in range(3)]
+            camera.cam_from_rig = colmap.Rigid3d(colmap.Rotation3d(turn), [0.0, 0.0, 0.0])
+        cameras.append(camera)
+    config = colmap.RigConfig()
+    config.cameras = cameras
+    with colmap.Database.open(ask["database"]) as there:
+        colmap.apply_rig_config([config], there)
 
 
 def match_all(colmap: Any, ask: dict[str, Any]) -> None:
@@ -210,6 +235,9 @@ def map_incrementally(colmap: Any, ask: dict[str, Any], out: str, total: int) ->
     options, count, attempt = colmap.IncrementalPipelineOptions(), 2, 0
     options.num_threads, options.random_seed, options.ba_use_gpu = ask["threads"], ask["seed"], False
     options.min_model_size = 3
+    if ask["rig"] is not None:
+        options.ba_refine_sensor_from_rig = False
+        options.constant_cameras = find_cut_cameras(colmap, ask)
 
     def start() -> None:  # from two photographs; again where they lead nowhere, and for photographs that do not fit the others
         nonlocal count, attempt
@@ -225,10 +253,20 @@ def map_incrementally(colmap: Any, ask: dict[str, Any], out: str, total: int) ->
     return colmap.incremental_mapping(ask["database"], ask["images"], out, options=options, **calls)
 
 
+def find_cut_cameras(colmap: Any, ask: dict[str, Any]) -> set[int]:
+    """Return the cameras of the views that were cut out of panoramas: their lens is known."""
+    with colmap.Database.open(ask["database"]) as there:
+        return {image.camera_id for image in there.read_all_images() if is_cut(image.name, ask)}
+
+
 def map_globally(colmap: Any, ask: dict[str, Any], out: str, total: int) -> dict[int, Any]:
     """Run GLOMAP, which solves for all photographs together."""
     options = colmap.GlobalPipelineOptions()
     options.num_threads, options.random_seed = ask["threads"], ask["seed"]
+    if ask["rig"] is not None:
+        options.mapper.refine_sensor_from_rig = False
+        if all(is_cut(name, ask) for names in ask["groups"] for name in names):
+            options.mapper.bundle_adjustment.refine_focal_length = options.mapper.bundle_adjustment.refine_extra_params = False
     return colmap.global_mapping(ask["database"], ask["images"], out, options=options)
 
 
@@ -256,6 +294,8 @@ def main() -> int:
         report(step="done")
         sys.stdout.flush()
         os._exit(0)
+    if ask["rig"] is not None:
+        tie_views(colmap, ask)
     match_all(colmap, ask)
     report(step="done", version=colmap.__version__, **estimate_poses(colmap, ask))
     sys.stdout.flush()

@@ -29,3 +29,15 @@ def test_photographs_are_matched_with_those_like_them_and_with_the_next_ones(mon
     assert {(0, 25), (0, 24), (0, 1), (0, 2), (0, 3), (3, 44), (48, 49)} <= set(near) and (0, 12) in spare
     assert near == sorted(set(near)) and not set(near) & set(spare) and all(i < j for i, j in [*near, *spare])
     assert len(near) <= 50 * (pairs.ALIKE + pairs.FOLLOWING) + 1
+
+
+def test_photographs_of_one_place_are_not_matched(monkeypatch):
+    ranks = [[(i + step) % 40 for step in range(1, 40)] for i in range(40)]
+    asked = []
+    monkeypatch.setattr(pairs, "describe_photos", lambda database, names: names)
+    monkeypatch.setattr(pairs, "rank_alike", lambda vectors, count: asked.append(count) or [row[:count] for row in ranks])
+    monkeypatch.setattr(pairs, "read_positions", lambda database, names: None)
+    monkeypatch.setattr(pairs, "find_near", lambda positions, count: [])
+    near, spare = pairs.find_alike(None, ["view"] * 40, [str(i // 4) for i in range(40)])
+    assert asked == [pairs.ALIKE + pairs.SPARE + 3] and all(i // 4 != j // 4 for i, j in [*near, *spare])
+    assert {(0, 4), (0, 13), (3, 4), (3, 6)} <= set(near)

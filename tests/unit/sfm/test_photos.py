@@ -8,9 +8,10 @@ import pytest
 from PIL import Image
 
 from scene_experts.core.errors import InputError
-from scene_experts.sfm.photos import check_in_place, copy_photos, find_photos, group_by_camera
+from scene_experts.sfm.photos import Photo, check_in_place, copy_photos, decide_round, find_photos, group_by_camera
 from support.messages import naming
 from support.photos import write_photo, write_turned
+from support.rooms import draw_panorama, paint_walls
 
 
 def test_names_are_sorted_by_their_numbers_and_hidden_files_are_ignored(tmp_path):
@@ -207,11 +208,21 @@ def test_all_unreadable_photographs_are_named_at_once(tmp_path):
         find_photos(tmp_path)
 
 
-def test_panoramas_are_told(tmp_path):
+def test_panoramas_are_found_by_their_data_or_their_shape_and_edges(tmp_path):
+    turned = lambda: [photo.name for photo in find_photos(tmp_path) if photo.round]  # noqa: E731
     for i in range(3):
         write_photo(tmp_path / f"{i}.jpg")
-    assert "360" not in said(tmp_path)[1]
-    Image.new("RGB", (2000, 1000)).save(tmp_path / "2.jpg")
-    assert "1 photographs look like 360 degree panoramas (2.jpg)" in said(tmp_path)[1] and "v360" in said(tmp_path)[1]
+    assert not turned()
     Image.new("RGB", (100, 60)).save(tmp_path / "2.jpg", xmp=b'<x GPano:ProjectionType="equirectangular"/>')
-    assert "2.jpg" in said(tmp_path)[1]
+    assert turned() == ["2.jpg"]
+    panorama = Image.fromarray(draw_panorama(paint_walls(64), (0.2, 0, 0.4), 0.3, 512)).resize((2000, 1000))
+    panorama.save(tmp_path / "2.jpg")
+    assert turned() == ["2.jpg"]
+    panorama.crop((250, 250, 750, 500)).resize((2000, 1000)).save(tmp_path / "2.jpg")
+    assert not turned()
+
+
+def test_photographs_of_one_camera_are_all_panoramas_or_none():
+    photos = [Photo(str(i), (20, 10), ("A",), round=i < 2) for i in range(4)] + [Photo("4", (20, 10), ("B",), round=False)]
+    assert [photo.round for photo in decide_round(photos)] == [True] * 4 + [False]
+    assert not any(photo.round for photo in decide_round([Photo(str(i), (20, 10), round=i < 1) for i in range(3)]))
