@@ -41,6 +41,16 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     return -10.0 * math.log10(max(float(mse), LEAST_MSE))
 
 
+def psnr_aligned(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Return the PSNR after the colours of a picture are aligned with the photograph's: by the
+    affine map of RGB with the least square error. It leaves exposure and white balance out."""
+    colors, wanted = (picture.reshape(-1, 3).double() for picture in (image, target))
+    inputs = torch.cat([colors, torch.ones_like(colors[:, :1])], 1)
+    weighted = inputs if mask is None else inputs * mask.reshape(-1, 1).double()
+    fit = torch.linalg.lstsq((weighted.T @ inputs).cpu(), (weighted.T @ wanted).cpu(), driver="gelsd").solution.to(image.device)
+    return psnr((inputs @ fit).clamp(0, 1).reshape(image.shape), target, mask)
+
+
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     """Return the structural similarity (3DGS's variant), 1 for identical pictures."""
     filled, area = _fill_masked(image, target, mask)
@@ -159,6 +169,7 @@ def score(image: Tensor, target: Tensor, mask: Tensor | None, perceptual: Percep
     with _full_precision():
         return {
             "psnr": psnr(image, target, mask),
+            "psnr_aligned": psnr_aligned(image, target, mask),
             "ssim": ssim(image, target, mask),
             **perceptual(image, target, mask),
             "detail": detail(image, target, mask),

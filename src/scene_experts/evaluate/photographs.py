@@ -84,6 +84,7 @@ def score_training_views(
             camera = view.camera.to(device)
             with torch.no_grad():
                 image = rasterize(draws(camera, step, Mode.DRAW, rasterize.visible).gaussians, camera, background).image
+                image = scene.as_photographed(image, camera)
             drawn, photo = pictures.to_8bit(image), frame.rgb.cpu().numpy()
             if frame.mask is None or bool(frame.mask.any()):
                 value = psnr(pictures.from_8bit(drawn), pictures.from_8bit(photo), None if frame.mask is None else frame.mask.cpu())

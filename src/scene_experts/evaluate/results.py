@@ -80,6 +80,7 @@ def describe_scores(per_view: dict[str, dict[str, Any]], perceptual: Perceptual)
         "absent": absent,
         "variants": VARIANTS,
         "masked": any(facts["masked"] for facts in scored.values()),
+        "psnr_aligned": mean_over_views(scored, "psnr_aligned"),
         "detail": mean_over_views(scored, "detail"),
         "sharpness": {"render": ours, "photo": theirs, "ratio": ours / theirs if theirs > 0 else None},
     }

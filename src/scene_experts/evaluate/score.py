@@ -93,7 +93,7 @@ def evaluate(
         fitted = halves.fitted_codes(scene, capture, rasterize, [chosen[n] for n in mine], step, background, fitting)
     with fitted, pictures.replacing(out / options.folder, group.first) as folder, pictures.Writer() as writer:
         group.wait()
-        drawing = Drawing(scene.frozen(step), rasterize, step, background, options.appearance == "half")
+        drawing = Drawing(scene.frozen(step), rasterize, step, background, options.appearance == "half", scene.as_photographed)
 
         def score_mine() -> dict[int, dict[str, Any]]:
             found = {}
@@ -198,6 +198,7 @@ class Drawing:
     step: int
     background: Tensor  # [3]
     half: bool  # score only the right half of each view
+    as_photographed: Callable[[Tensor, Camera], Tensor]
 
     @torch.no_grad()
     def draw(self, capture: Capture, index: int, camera: Camera) -> tuple[Shown, dict[str, Any]]:
@@ -205,7 +206,8 @@ class Drawing:
         frame = capture.frame(index)
         decoded = self.draws(camera, self.step, Mode.DRAW, self.rasterize.visible)
         render = self.rasterize(decoded.gaussians, camera, self.background)
-        photo, drawn = frame.rgb.cpu().numpy(), pictures.to_8bit(render.image)
+        image = self.as_photographed(render.image, camera)
+        photo, drawn = frame.rgb.cpu().numpy(), pictures.to_8bit(image)
         if photo.shape != drawn.shape:
             raise InputError(
                 f"expected {capture.views[index].name} with {drawn.shape[1]} x {drawn.shape[0]} px, found "

@@ -50,7 +50,12 @@ class Painter:
 
     def picture_8bit(self, camera: Camera, background: Tensor) -> Tensor:
         """The picture [H, W, 3] as an 8-bit file holds it, in [0, 1]."""
-        return (self.picture(camera, background).clamp(0, 1) * 255 + 0.5).floor() / 255
+        return round_to_8_bit(self.picture(camera, background))
+
+
+def round_to_8_bit(picture: Tensor) -> Tensor:
+    """A picture [H, W, 3] as an 8-bit file holds it, in [0, 1]."""
+    return (picture.clamp(0, 1) * 255 + 0.5).floor() / 255
 
 
 @dataclass(frozen=True)
@@ -98,7 +103,7 @@ def cost(
         return Cost(lines=(f"{why}: what the file costs in PSNR was not measured",))
     drawn = {"run": (run.scene, run.step), **scenes()}
     painters = {name: Painter.of(scene, step, rasterize, run.config.train.antialias) for name, (scene, step) in drawn.items()}
-    found = scores(painters, capture, views, tell)
+    found = scores(painters, capture, views, tell, run.scene.as_photographed)
     before, after = found["run"].photographs, found["file"].photographs
     lines = [f"PSNR of {len(views)} held-out views: run {before:.3f} dB, this file {after:.3f} dB ({after - before:+.3f})"]
     if "bake" in found:
@@ -147,13 +152,21 @@ def why_no_views(capture: Capture) -> str:
 
 
 @torch.no_grad()
-def scores(painters: Mapping[str, Painter], capture: Capture, views: Sequence[int], tell: Tell | None = None) -> dict[str, Score]:
-    """The score of each scene over `views` (at least one, of `scored_views`) of the capture."""
+def scores(
+    painters: Mapping[str, Painter],
+    capture: Capture,
+    views: Sequence[int],
+    tell: Tell | None = None,
+    as_photographed: Callable[[Tensor, Camera], Tensor] = lambda picture, camera: picture,
+) -> dict[str, Score]:
+    """The score of each scene over `views` (at least one, of `scored_views`) of the capture.
+    as_photographed: as `Scene.as_photographed`."""
     background = torch.tensor(capture.background)
     totals = {name: [0.0, 0.0] for name in painters}
     for i, index in enumerate(views):
         camera, frame = capture.views[index].camera, capture.frame(index)
-        pictures = {name: painter.picture_8bit(camera, background) for name, painter in painters.items()}
+        drawn = {name: painter.picture(camera, background) for name, painter in painters.items()}
+        pictures = {name: round_to_8_bit(as_photographed(picture, camera)) for name, picture in drawn.items()}
         first = next(iter(pictures.values()))
         for name, image in pictures.items():
             totals[name][0] += psnr(image, frame.rgb.float() / 255, frame.mask)

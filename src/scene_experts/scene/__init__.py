@@ -20,6 +20,7 @@ from scene_experts.core.types import Camera, Decoded, Mode, Points, Routing
 if TYPE_CHECKING:
     from scene_experts.scene.anchors.appearance import Codes
     from scene_experts.scene.anchors.quantise import RowRounding
+    from scene_experts.scene.exposure import Exposures
 
 Cull = Callable[[Tensor, Tensor, Camera], Tensor]
 """The rasteriser's visibility test: means [n, 3], scales [n, 3], camera -> [n] bool."""
@@ -85,12 +86,14 @@ class Scene(nn.Module):
 
     dense_until: int = 0  # last iteration of the experts' dense warm-up; 0 without one
     codes: Codes | None  # appearance codes; None where `traits.appearance` is 0
+    exposures: Exposures | None  # of the training photographs; None: all are taken to have one
 
     def __init__(self, table: Table, extent: float) -> None:
         """extent: the extent R of the capture, in trained world units."""
         super().__init__()
         self.table, self.extent = table, extent
         self.codes = None
+        self.exposures = None
 
     @property
     @abstractmethod
@@ -153,6 +156,11 @@ class Scene(nn.Module):
         Do not train the scene while the result is in use.
         """
         return self
+
+    def as_photographed(self, image: Tensor, camera: Camera) -> Tensor:
+        """Return a picture [H, W, 3] of the scene with the exposure of a camera's photograph; the
+        picture itself where no exposures are learned. For comparisons with photographs."""
+        return image if self.exposures is None else self.exposures.expose(image, camera)
 
     @property
     def rounding(self) -> RowRounding | None:

@@ -71,6 +71,9 @@ class Train:
     mean_background: bool = False
     """Put the mean colour of the training photographs behind what none of them shows, unless
     --background names a colour or the photographs are transparent or masked."""
+    exposure: bool = False
+    """Learn the exposure and white balance of each training photograph. The scene is that of their
+    mean; `eval` draws a held-out view at the exposure of the photographs near it."""
     max_anchors: CountOrNone = 0
     """Stop densification at this number of anchors; 0 leaves that of the growth rule (a million for
     3dgs-mcmc, otherwise none)."""

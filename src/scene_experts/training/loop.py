@@ -106,7 +106,7 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
     run.begin(training)
     about = training.scene.describe_decode(training.step + 1)
     direct = direct_of(training, rasterize, training.scene)
-    gradients = "" if direct is None else "through autograd (--shard)" if run.shard else direct.describe(training.scene, training.step + 1)
+    gradients = "" if direct is None else explain_step(training, run, direct)
     yield Started(training.step, total, training.scene.table.total, training.scene.traits, about, training.computed, gradients)
     saved = training.step
     parts: Mapping[str, Tensor] = {}  # terms of the last iteration
@@ -149,6 +149,12 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
         yield Stopped(training.step, run.stop[0])
     else:
         yield Finished(training.step, training.clock.seconds)
+
+
+def explain_step(training: Training, run: Job, direct: DirectStep) -> str:
+    """Say how a view is differentiated on a GPU, for `Started.gradients`."""
+    why = "--shard" if run.shard else "--exposure" if training.scene.exposures is not None else ""
+    return f"through autograd ({why})" if why else direct.describe(training.scene, training.step + 1)
 
 
 def last_iteration(cfg: Train, run: Job) -> int:
@@ -315,12 +321,13 @@ def see_view(
     target, mask = photographs.see(index)
     training.seed_view(number)
     direct = direct_of(training, rasterize, scene)
-    if direct is not None and not direct.refused:
+    if direct is not None and not direct.refused and scene.exposures is None:
         decoded, render, terms = direct.see(scene, camera, number, target, mask, photographs.background(color))
         training.largest.see(decoded, render)
         return Iteration(decoded, render, terms, target, mask)
     decoded = scene(camera, number, Mode.TRAIN, rasterize.visible)
     render = rasterize(decoded.gaussians, camera, photographs.background(color))
+    render = replace(render, image=scene.as_photographed(render.image, camera))
     parts = compute_terms(Sample(decoded, render, target, mask, number), cfg.loss)
     loss = torch.stack(list(parts.values())).sum()
     if loss.requires_grad:
@@ -354,7 +361,9 @@ def survey_of(training: Training, run: Job, capture: Capture, rasterize: Rasteri
     """Return the training views as densification can look at them."""
 
     def photo(index: int) -> TrainingPhoto:
-        return TrainingPhoto(capture.views[index].camera.to(run.device, run.dtype), *resident_of(training, run, capture).see(index))
+        camera, (image, mask) = capture.views[index].camera.to(run.device, run.dtype), resident_of(training, run, capture).see(index)
+        exposures = training.scene.exposures
+        return TrainingPhoto(camera, image if exposures is None else exposures.undo(image, camera), mask)
 
     return Survey(capture.train, photo, rasterize, resident_of(training, run, capture).background(None))
 

@@ -35,6 +35,7 @@ from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.obtain import resolve
 from scene_experts.data.settings import Data
 from scene_experts.scene import Scene
+from scene_experts.scene.exposure import Exposures
 from scene_experts.scene.fit import restore_foreign
 from scene_experts.training import capture_place
 from scene_experts.training.capture_place import Lone
@@ -293,6 +294,7 @@ def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun
     with guarding(run, RUN):
         checkpoint.expect(meta, recipe=config.train.recipe)
         scene = restore_foreign(config.train.scaled_scene(), tensors, meta, averaged=True)
+        scene.exposures = Exposures.restore(tensors)
         opened = OpenRun(run, config, scene, int(meta["step"]), Clock.of(meta), meta.get("capture", ""), meta.get("poses", ""))
     return replace(opened, scene=scene.to(device))
 

@@ -22,6 +22,7 @@ from scene_experts.core.reading.source import guarding
 from scene_experts.data.capture import Capture
 from scene_experts.data.settings import Data
 from scene_experts.scene import Scene, SceneConfig, restore_scene
+from scene_experts.scene.exposure import GROUP, Exposures
 from scene_experts.scene.fit import restore_foreign
 from scene_experts.training.average import Averages
 from scene_experts.training.clock import Clock
@@ -67,6 +68,8 @@ class Training:
         self.optimizer = cfg.optimizer.for_batch(cfg.batch).build(groups)
         scene.table.attach(self.optimizer)
         self.averages = Averages(scene) if cfg.average.span > 0 else None
+        if scene.exposures is not None:
+            self.add_groups({GROUP: [scene.exposures.stops]})
         self.rate = RateTerm(cfg.rate, cfg.seed, cfg.growth, cfg.iterations) if cfg.rate else None
 
     @classmethod
@@ -89,6 +92,7 @@ class Training:
             raise InputError(f"expected at most {cap:,} {traits.rows} to start with, found {n:,}; raise --max-anchors{also}")
         if 0 < cfg.growth.max_anchors < n:
             log.warning("starts with %s rows, more than the recipe's %s: none will be added", f"{n:,}", f"{cfg.growth.max_anchors:,}")
+        scene.exposures = new_exposures(cfg, capture)
         return cls(cfg, scene.to(device, dtype))
 
     @classmethod
@@ -131,7 +135,8 @@ class Training:
             with guarding(run, RUN):
                 scene = restore_foreign(cfg.scene, tensors, meta, averaged=True).to(device)
                 scene.forget_rounding()
-                training = cls(cfg, scene)
+                scene.exposures = new_exposures(cfg, capture)
+                training = cls(cfg, scene.to(device))
         except InputError as error:
             if other := _changes(before.train.scene, now.train.scene, "scene"):
                 raise InputError(f"expected a scene of the kind that {run} of --init-from has{other}; use the flags of that run") from error
@@ -173,6 +178,8 @@ class Training:
         `batch_rates`."""
         for group in self.optimizer.param_groups:
             own = None if self.rate is None else self.rate.learning_rate(group["name"], self.step)
+            if group["name"] == GROUP and self.scene.exposures is not None:
+                own = self.scene.exposures.learning_rate(self.step, self.cfg.iterations)
             rate = self.cfg.rates.at(group["name"], self.step, self.cfg.iterations, self.scene.extent) if own is None else own
             group["lr"] = rate * self.cfg.batch**self.cfg.batch_rates
 
@@ -241,6 +248,7 @@ class Training:
         if self.averages is not None:
             out |= self.averages.tensors()
         out |= {} if self.rate is None else self.rate.tensors(self.scene)
+        out |= {} if self.scene.exposures is None else self.scene.exposures.tensors()
         out["queue"] = torch.tensor(self.queue, dtype=torch.int64)
         return out
 
@@ -262,6 +270,7 @@ class Training:
         configuration."""
         check_same(cfg, meta)
         scene = restore_foreign(cfg.scene, tensors, meta)
+        scene.exposures = Exposures.restore(tensors) if cfg.exposure else None
         scene.table.stats = {k.removeprefix("stats."): v for k, v in tensors.items() if k.startswith("stats.")}
         training = cls(cfg, scene.to(device))
         table = training.scene.table
@@ -287,6 +296,11 @@ class Training:
         training.capture_id, training.poses = meta.get("capture", ""), meta.get("poses", "")
         training.chosen = meta.get("chosen")
         return training
+
+
+def new_exposures(cfg: Train, capture: Capture) -> Exposures | None:
+    """Return the exposures of a training that begins; None where it learns none."""
+    return Exposures([capture.views[i].camera for i in capture.train]) if cfg.exposure else None
 
 
 def _changes(before: Data | SceneConfig, now: Data | SceneConfig, where: str = "") -> str:

@@ -79,6 +79,7 @@ class Judge:
         if not self.has_photographs:
             return UNKNOWN_ERROR
         frame = self.capture.frame(index)
+        image = self.run.scene.as_photographed(image, self.capture.views[index].camera)
         return 10 ** (-0.1 * psnr(image, frame.rgb.float() / 255, frame.mask))
 
     @torch.no_grad()

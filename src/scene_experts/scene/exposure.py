@@ -1,0 +1,107 @@
+"""Exposure and white balance of each training photograph, for captures whose camera changes them.
+
+A photograph is the picture of the scene times a gain for each channel, in linear light: the
+response is taken as x^(1 / GAMMA), so that a picture times 2^(s / GAMMA) is one that is s stops
+brighter. Brighter than white is white. The gains of all training photographs have the mean 1 (their
+logarithms have the mean 0), so the scene itself is that of the mean exposure: files and viewers need
+nothing else. After PPISP (Deutsch et al., CVPR 2026), whose vignette and learned response are left
+out here: on fox they changed nothing (results/exposure.md).
+
+A camera that took no training photograph has the gains of those near it: the mean with weights
+1 / d^2, where d is the distance between the positions, over their mean distance from their middle,
+plus that between the directions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from scene_experts.core.schedule import Rate
+from scene_experts.core.types import Camera
+
+GAMMA = 2.2
+GROUP = "exposure"  # name of the learning rate, and of the tensors in a checkpoint
+RATE = Rate(0.01, 0.0001)  # stops, from the start of the training to the end
+RISE = 100  # iterations in which the rate rises linearly to it
+NEAREST = 1e-3  # of d: cameras nearer to a training camera have its gains
+
+
+class Exposures(nn.Module):
+    """Gains of the training photographs, by the ids of their cameras."""
+
+    stops: nn.Parameter  # [V, 3] RGB
+    positions: Tensor  # [V, 3] trained world
+    directions: Tensor  # [V, 3] unit
+    ids: Tensor  # [V] int64
+
+    def __init__(self, cameras: Sequence[Camera]) -> None:
+        super().__init__()
+        self.stops = nn.Parameter(torch.zeros(len(cameras), 3))
+        self.register_buffer("ids", torch.tensor([camera.id for camera in cameras]))
+        self.register_buffer("positions", torch.stack([camera.position.cpu().float() for camera in cameras]))
+        self.register_buffer("directions", torch.stack([_direction(camera) for camera in cameras]))
+        self.row = {camera.id: i for i, camera in enumerate(cameras)}
+
+    @classmethod
+    def restore(cls, tensors: Mapping[str, Tensor]) -> Exposures | None:
+        """Return those of a checkpoint's tensors; None if it has none."""
+        if f"{GROUP}.stops" not in tensors:
+            return None
+        made = cls.__new__(cls)
+        nn.Module.__init__(made)
+        made.stops = nn.Parameter(tensors[f"{GROUP}.stops"].clone())
+        for name in ("ids", "positions", "directions"):
+            made.register_buffer(name, tensors[f"{GROUP}.{name}"].clone())
+        made.row = {int(id): i for i, id in enumerate(made.ids.tolist())}
+        return made
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the tensors by their names in a checkpoint."""
+        return {f"{GROUP}.{name}": value.detach() for name, value in self.state_dict().items()}
+
+    def stops_of(self, camera: Camera) -> Tensor:
+        """Return the stops [3] of a camera, relative to the mean of the training photographs."""
+        stops = self.stops - self.stops.mean(0)
+        row = self.row.get(camera.id)
+        if row is not None:
+            return stops[row]
+        spread = (self.positions - self.positions.mean(0)).norm(dim=1).mean().clamp_min(1e-12)
+        away = (self.positions - camera.position.to(self.positions)).norm(dim=1) / spread
+        away = away + (self.directions - _direction(camera).to(self.directions)).norm(dim=1)
+        weights = away.clamp_min(NEAREST).pow(-2)
+        return weights @ stops / weights.sum()
+
+    def expose(self, image: Tensor, camera: Camera) -> Tensor:
+        """Return the picture [H, W, 3] of the scene as a camera photographs it, at most 1."""
+        return _Bounded.apply(image * torch.exp2(self.stops_of(camera) / GAMMA).to(image))
+
+    @torch.no_grad()
+    def undo(self, photograph: Tensor, camera: Camera) -> Tensor:
+        """Return a photograph [H, W, 3] as it would be at the mean exposure."""
+        return photograph / torch.exp2(self.stops_of(camera) / GAMMA).to(photograph)
+
+    def learning_rate(self, step: int, total: int) -> float:
+        """Return the learning rate at `step` of `total`."""
+        return RATE.at(step, total) * min(1.0, step / RISE)
+
+
+class _Bounded(torch.autograd.Function):
+    """min(x, 1). Where x is above 1, only gradients that lower it pass."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:  # type: ignore[override]
+        ctx.save_for_backward(x)
+        return x.clamp(max=1.0)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # type: ignore[override]
+        (x,) = ctx.saved_tensors
+        return torch.where((x > 1) & (gradient < 0), 0.0, gradient)
+
+
+def _direction(camera: Camera) -> Tensor:
+    return camera.world_to_cam[2, :3].cpu().float()

@@ -1,0 +1,77 @@
+"""Exposures of photographs: gains in linear light, their gauge, and cameras that took none."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from scene_experts.scene.exposure import GAMMA, Exposures
+from support.scenes import CAMERA
+
+
+def camera_at(id, x, turn=0.0):
+    pose = CAMERA.world_to_cam.clone()
+    pose[0, 3] -= x
+    return replace(CAMERA, world_to_cam=pose, id=id)
+
+
+@pytest.fixture
+def exposures():
+    made = Exposures([camera_at(i, x) for i, x in ((3, 0.0), (5, 1.0), (9, 2.0))])
+    with torch.no_grad():
+        made.stops.copy_(torch.tensor([[1.0, 1.0, 1.0], [0.0, 0.2, 0.0], [-0.5, -0.5, 0.1]]))
+    return made
+
+
+def test_a_stop_doubles_linear_light_and_white_is_the_limit(exposures):
+    picture = torch.tensor([[[0.2, 0.3, 0.9]]])
+    stops = exposures.stops_of(camera_at(3, 0.0))
+    assert torch.allclose(stops, exposures.stops[0] - exposures.stops.mean(0))
+    seen = exposures.expose(picture, camera_at(3, 0.0))
+    linear, before = seen**GAMMA, picture**GAMMA
+    assert torch.allclose(linear[..., :2], (before * 2**stops)[..., :2]) and float(seen.detach().max()) == 1
+    assert torch.allclose(exposures.undo(seen.detach(), camera_at(3, 0.0))[..., :2], picture[..., :2])
+
+
+def test_the_mean_of_the_photographs_is_the_scene(exposures):
+    stops = torch.stack([exposures.stops_of(camera_at(i, 0.0)) for i in (3, 5, 9)])
+    assert torch.allclose(stops.mean(0), torch.zeros(3), atol=1e-6)
+
+
+def test_a_camera_without_photograph_has_the_gains_of_those_near_it(exposures):
+    at = lambda x: exposures.stops_of(camera_at(100, x))  # noqa: E731
+    known = exposures.stops.detach() - exposures.stops.detach().mean(0)
+    assert torch.allclose(at(1.0), known[1], atol=1e-3)
+    spread = 2 / 3  # mean distance of the positions from their middle
+    weights = torch.tensor([(0.5 / spread) ** -2, (0.5 / spread) ** -2, (1.5 / spread) ** -2])
+    assert torch.allclose(at(0.5), weights @ known / weights.sum(), atol=1e-5)
+
+
+def test_gradients_are_those_of_finite_differences(exposures):
+    made, camera = exposures.double(), camera_at(5, 1.0)
+    picture = torch.rand(3, 4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 0.5 + 0.1
+    picture.requires_grad_()
+
+    def of_stops(stops):
+        made.stops.data = stops.data
+        gains = torch.exp2((stops - stops.mean(0))[1] / GAMMA)
+        return picture * gains
+
+    (made.expose(picture, camera).square().sum()).backward()
+    stops = made.stops.detach().clone().requires_grad_()
+    of_stops(stops).square().sum().backward()
+    assert torch.allclose(made.stops.grad, stops.grad)
+    assert torch.autograd.gradcheck(lambda image: made.expose(image, camera), (picture,))
+
+
+def test_above_white_only_gradients_that_darken_pass(exposures):
+    picture = torch.tensor([[[0.99, 0.99, 0.5]]], requires_grad=True)
+    exposures.expose(picture, camera_at(3, 0.0)).backward(torch.tensor([[[1.0, -1.0, -1.0]]]))
+    assert picture.grad[0, 0, 0] > 0 and picture.grad[0, 0, 1] == 0 and picture.grad[0, 0, 2] < 0
+
+
+def test_they_come_back_from_a_checkpoint(exposures):
+    made = Exposures.restore(exposures.tensors())
+    for camera in (camera_at(9, 0.0), camera_at(7, 0.3)):
+        assert torch.equal(made.stops_of(camera), exposures.stops_of(camera))
+    assert Exposures.restore({}) is None
