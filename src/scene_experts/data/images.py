@@ -22,7 +22,8 @@ from scene_experts.core.reading.budget import PHOTOGRAPH
 from scene_experts.core.reading.deep_colors import describe_mode
 from scene_experts.core.reading.pictures import opening_picture
 from scene_experts.data.colour import White, lift, to_8_bit
-from scene_experts.data.lens import Lens, to_pinhole
+from scene_experts.data.equirectangular import PanoramaView, find_places
+from scene_experts.data.lens import PANORAMA_VIEW, Lens, to_pinhole
 from scene_experts.data.masks import Mask, read_mask
 
 Size = tuple[int, int]  # width, height
@@ -225,6 +226,10 @@ def _make_grid(lens: Lens) -> Tensor:
     """Return where each pixel of the undistorted image lies in the photograph: [h, w, 2] float32 in
     [-1, 1], for grid_sample."""
     pinhole = to_pinhole(lens)
+    if lens.model == PANORAMA_VIEW:
+        view = PanoramaView(round(lens.value("yaw")), round(lens.value("pitch")))
+        places = find_places(view, pinhole.width, (lens.width, lens.height))
+        return places * torch.tensor([2 / lens.width, 2 / lens.height]) - 1
     out = np.empty((pinhole.height, pinhole.width, 2), np.float32)
     u = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
     for top in range(0, pinhole.height, 64):  # strips keep the float64 temporaries small

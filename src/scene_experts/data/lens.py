@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from scene_experts.core.errors import InputError
 from scene_experts.data import lens_forms as forms
+from scene_experts.data.equirectangular import PanoramaView, view_side
 from scene_experts.data.lens_forms import LARGEST_ANGLE
 
 Array = NDArray[np.floating]
@@ -41,9 +42,12 @@ MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_FISHEYE": ("f", "cx", "cy"),
     "FISHEYE": ("fx", "fy", "cx", "cy"),
     "EUCM": ("fx", "fy", "cx", "cy", "alpha", "beta"),
+    "EQUIRECTANGULAR": ("w", "h"),  # a panorama, 360 degrees around: captures have views of it (`view_of_panorama`)
     "BROWN": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "skew"),  # skew: of v in u
 }
-COLMAP_MODELS = tuple(name for name in MODELS if name != "BROWN")
+PANORAMA, PANORAMA_VIEW = "EQUIRECTANGULAR", "PANORAMA_VIEW"
+MODELS[PANORAMA_VIEW] = ("fx", "fy", "yaw", "pitch")  # of `data.equirectangular`, degrees
+COLMAP_MODELS = tuple(name for name in MODELS if name not in ("BROWN", PANORAMA_VIEW))
 FISHEYE = frozenset(name for name in MODELS if name.endswith("FISHEYE"))
 DIVISION = ("SIMPLE_DIVISION", "DIVISION")
 _LARGEST, _LONGEST = 1e9, 1 << 20  # of a parameter, and of a side in pixels
@@ -105,7 +109,11 @@ class Lens:
         geometric = {"f", "fx", "fy", "cx", "cy"}
         if self.model == "EUCM":
             return self.value("alpha") != 0
-        return self.model in FISHEYE or any(p != 0 for n, p in zip(MODELS[self.model], self.params) if n not in geometric)
+        return (
+            self.model in FISHEYE
+            or self.model == PANORAMA_VIEW
+            or any(p != 0 for n, p in zip(MODELS[self.model], self.params) if n not in geometric)
+        )
 
     def resize(self, width: int, height: int) -> Lens:
         """Return the same lens for an image of another size. Each axis is scaled by its own ratio,
@@ -240,10 +248,6 @@ _TWO_FOCALS = {
 
 def unreadable_model(found: str | int) -> str:
     """Return what to do about a camera model, by its name or COLMAP's id, that is not read."""
-    if found in ("EQUIRECTANGULAR", len(COLMAP_MODELS)):
-        return (
-            "expected photographs with one direction of view, found 360 degree ones (EQUIRECTANGULAR); cut them into perspective pictures"
-        )
     return (
         f"expected a camera model among {', '.join(COLMAP_MODELS)}, found {found!r}; undistort the photographs with "
         f"`colmap image_undistorter`, which writes PINHOLE"
@@ -261,6 +265,9 @@ def to_pinhole(lens: Lens) -> Lens:
     lies at the fold of the lens. A lens without distortion keeps its size.
     """
     w, h = lens.width, lens.height
+    if lens.model == PANORAMA_VIEW:
+        side = view_side(w)
+        return Lens("PINHOLE", side, side, (side / 2, side / 2, side / 2, side / 2))
     if not lens.distorted:
         return Lens("PINHOLE", w, h, (lens.fx, lens.fy, lens.cx, lens.cy))
 
@@ -288,6 +295,12 @@ def to_pinhole(lens: Lens) -> Lens:
     scale_y = 1 / max(lens.cy / max(lens.cy - top, 1e-9), (h - 0.5 - lens.cy) / max(bottom - lens.cy, 1e-9), 1e-9)
     width, height = (max(1, int(min(max(s, 0.2), 2.0) * n)) for s, n in ((scale_x, w), (scale_y, h)))
     return Lens("PINHOLE", width, height, (lens.fx, lens.fy, lens.cx * width / w, lens.cy * height / h))
+
+
+def view_of_panorama(lens: Lens, view: PanoramaView) -> Lens:
+    """Return the lens of a view that is cut out of a panorama while it is read."""
+    focal = view_side(lens.width) / 2
+    return Lens(PANORAMA_VIEW, lens.width, lens.height, (focal, focal, view.yaw, view.pitch))
 
 
 def centre_principal_point(lens: Lens) -> Lens:

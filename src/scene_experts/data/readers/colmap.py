@@ -3,13 +3,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+
+import numpy as np
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.reading.budget import CAPTURE
 from scene_experts.core.reading.source import guarding
 from scene_experts.core.types import Points
+from scene_experts.data.equirectangular import VIEWS
+from scene_experts.data.lens import PANORAMA, view_of_panorama
 from scene_experts.data.match import absent_error, match_images
 from scene_experts.data.points import find_cloud, from_arrays, read_points
 from scene_experts.data.readers.colmap_model import Model, count_images, find_models, holds_model, read_model
@@ -54,7 +59,10 @@ class ColmapReader:
         images = []
         for image in sorted(model.images, key=lambda i: i.name):
             if image.name in match.found:
-                images.append(PosedImage(image.name, match.found[image.name], model.cameras[image.camera_id], image.world_to_cam()))
+                posed = PosedImage(image.name, match.found[image.name], model.cameras[image.camera_id], image.world_to_cam())
+                images += cut_views(posed) if model.cameras[image.camera_id].model == PANORAMA else [posed]
+        if len(images) > len(match.found):
+            warnings.append(f"{len(images)} views are cut out of the 360 degree panoramas, {len(VIEWS)} of each, while they are read")
         points, cloud = _read_points(folder, place, model, warnings) if options.points else (None, None)
         source = "points3D.bin, points3D.txt or points3D.ply"
         return RawCapture(images, points, warnings, points_source=source, cloud=cloud, model=place)
@@ -122,3 +130,15 @@ def _read_points(folder: Path, place: Path, model: Model, warnings: list[str]) -
 
 
 READER = ColmapReader()
+
+
+def cut_views(posed: PosedImage) -> list[PosedImage]:
+    """Return the perspective views of a panorama, named NAME/VIEW.EXTENSION."""
+    assert posed.lens is not None
+    views, name = [], PurePosixPath(posed.name)
+    for view in VIEWS:
+        turn = np.eye(4)
+        turn[:3, :3] = view.rig_from_view.T
+        called = str(name.with_suffix("") / f"{view.folder}{name.suffix}")
+        views.append(replace(posed, name=called, lens=view_of_panorama(posed.lens, view), world_to_cam=turn @ posed.world_to_cam))
+    return views

@@ -9,13 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from scene_experts.core.errors import InputError
+from scene_experts.data.equirectangular import VIEWS, find_places, sample
+from scene_experts.data.lens import Lens
 from scene_experts.data.readers.colmap import READER
-from scene_experts.data.readers.colmap_model import read_model, write_model
+from scene_experts.data.readers.colmap_model import ColmapImage, Model, read_model, write_model
 from scene_experts.data.readers.reader import ReadOptions
 from support.captures import load
 from support.messages import naming
+from support.rooms import draw_panorama, paint_walls
 from support.synthetic import Synthetic, make_capture
 
 
@@ -146,3 +150,32 @@ def test_truncated_models(copy: Path, part: str) -> None:
     path.write_bytes(path.read_bytes()[:-5])
     with pytest.raises(InputError, match=part):
         load(copy)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_panoramas_are_read_as_views_of_them(tmp_path, text):
+    width, walls, place = 256, paint_walls(64), np.array([0.3, -0.2, 0.1])
+    panorama = draw_panorama(walls, place, 0.0, width)
+    (tmp_path / "images" / "a").mkdir(parents=True)
+    Image.fromarray(panorama).save(tmp_path / "images" / "a" / "0.png")
+    count = np.full((width // 2, width), 255, np.uint8)
+    count[:, : width // 2] = 0
+    Image.fromarray(count).save(tmp_path / "images" / "a" / "0_mask.png")
+    cameras = {1: Lens("EQUIRECTANGULAR", width, width // 2, (width, width // 2))}
+    image = ColmapImage(1, "a/0.png", (1.0, 0.0, 0.0, 0.0), tuple((-place).tolist()), 1)
+    points = np.random.default_rng(0).uniform(-1, 1, (40, 3))
+    model = Model(cameras, (image,), np.arange(40), points, np.zeros((40, 3), np.uint8), np.ones(40))
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    write_model(tmp_path / "sparse" / "0", model, text=text)
+    capture = load(tmp_path, split="none", normalise="none")
+    assert len(capture.views) == len(VIEWS) and capture.views[0].name == "a/0/yaw000_pitch+35.png"
+    for index, view in enumerate(capture.views):
+        cut = next(v for v in VIEWS if v.folder in view.name)
+        assert np.allclose(view.camera.position, place, atol=1e-5)
+        assert np.allclose(view.camera.world_to_cam[:3, :3], cut.rig_from_view.T, atol=1e-6)
+        frame, side = capture.frame(index), view.camera.width
+        wanted = sample(panorama, find_places(cut, side, (width, width // 2)))
+        assert np.median(np.abs(frame.rgb.numpy().astype(int) - wanted)) <= 5 and view.camera.fov == pytest.approx(np.pi / 2)
+    masks = {view.name: capture.frame(i).mask for i, view in enumerate(capture.views)}
+    left, right = masks["a/0/yaw270_pitch+35.png"], masks["a/0/yaw090_pitch+35.png"]
+    assert right is None and left is not None and float(left.float().mean()) < 0.02

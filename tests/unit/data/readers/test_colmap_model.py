@@ -177,7 +177,7 @@ def test_unknown_model_name(tmp_path: Path) -> None:
         read_model(tmp_path)
 
 
-@pytest.mark.parametrize(("number", "name"), [(17, "EQUIRECTANGULAR"), (99, "colmap image_undistorter")])
+@pytest.mark.parametrize(("number", "name"), [(18, "colmap image_undistorter"), (99, "colmap image_undistorter")])
 def test_the_refusal_of_a_model_says_what_to_do(tmp_path: Path, number: int, name: str) -> None:
     with_tracks(tmp_path)
     (tmp_path / "cameras.bin").write_bytes(struct.pack("<QiiQQ4d", 1, 7, number, 640, 480, 500.0, 501.0, 320.5, 240.25))
