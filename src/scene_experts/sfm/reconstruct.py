@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +26,15 @@ from scene_experts.data.match import EXTENSIONS
 from scene_experts.data.readers import is_capture
 from scene_experts.native import library as native
 from scene_experts.sfm import frames, photos, work, worker
+from scene_experts.sfm.learned import attempt
+from scene_experts.sfm.learned.photographs import Shots
 from scene_experts.sfm.masks import write_masks
 from scene_experts.sfm.options import SfmOptions
 from scene_experts.sfm.pairs import choose_pairs, find_alike
 from scene_experts.sfm.photos import Photo
 
 LOG, NOTE, VIDEO = "colmap.log", "capture.json", "video.txt"
+LEARNED = "database/learned"  # features and matches of networks, removed with the database
 
 Say = Callable[[str], None]
 
@@ -58,6 +62,7 @@ def reconstruct(
         RunError: if COLMAP fails.
     """
     check_request(source, out, overwrite)
+    attempt.check_features(options.features)
     found = [] if source.is_file() else photos.find_photos(source, exclude=out, say=say)
     with work.open_work_folder(out) as folder:
         check_request(source, out, overwrite)  # again: results of a killed process may just have been published
@@ -89,6 +94,8 @@ def reconstruct(
             "groups": groups,
             "pairs": None if pairs is None else [(names[i], names[j]) for i, j in pairs],
             "spare": [],
+            "learned": "",
+            "poses": True,
             "threads": options.threads or native.count_cores(),
             "max_side": options.max_side,
             "camera_model": options.camera_model,
@@ -96,13 +103,15 @@ def reconstruct(
             "seed": options.seed,
         }
         began = time.monotonic()
+        spare: list[tuple[int, int]] = []
         if pairs is None:  # the features decide
-            run_worker(request, folder / LOG, say, progress)
+            run_worker({**request, "poses": False}, folder / LOG, say, progress)
             pairs, spare = find_alike(Path(request["database"]), names)
             say(f"{len(pairs):,} of {every:,} pairs to match: photographs that look alike, and each with those that follow it")
             asked = {"pairs": pairs, "spare": spare}
             request = {**request, **{name: [(names[i], names[j]) for i, j in some] for name, some in asked.items()}}
-        result = run_worker(request, folder / LOG, say, progress)
+        shots = Shots(names, images, folder / "masks" if masks else None, folder / LEARNED, options.max_side, request["threads"])
+        result = run_features(request, shots, pairs, spare, options, folder, say, progress)
         if not result["registered"]:
             raise InputError(
                 f"expected overlapping photographs of one scene in {source}, found none that fit together; take more sharp photographs "
@@ -113,6 +122,31 @@ def reconstruct(
         work.publish(out)
     shutil.rmtree(out / work.NAME, ignore_errors=True)
     return note
+
+
+def run_features(
+    request: dict[str, Any],
+    shots: Shots,
+    pairs: list[tuple[int, int]],
+    spare: list[tuple[int, int]],
+    options: SfmOptions,
+    folder: Path,
+    say: Say,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Find poses by COLMAP's features, by learned ones too, or by one after the other, and return
+    the result that is kept."""
+    run = partial(run_worker, log=folder / LOG, say=say, progress=progress)
+    if options.features == "learned":
+        run({**request, "poses": False})
+        return {**attempt.reconstruct_with(shots, pairs, request, run, say, progress), "features": "SIFT and ALIKED"}
+    result = run(request)
+    if not attempt.is_wanted(options.features, result, len(shots.names), say):
+        return result
+    model = Path(request["model"])
+    again = {**request, "maps": str(folder / "maps" / "learned"), "model": str(folder / "maps" / "learned-model")}
+    some = attempt.choose_pairs(pairs, spare, shots.names, result["lacking"])
+    return attempt.keep_better(result, attempt.reconstruct_with(shots, some, again, run, say, progress), (model, Path(again["model"])), say)
 
 
 def check_request(source: Path, out: Path, overwrite: bool) -> None:
@@ -254,7 +288,7 @@ def describe_result(
     matched with each other.
     """
     registered = set(result["registered"])
-    facts = {k: v for k, v in result.items() if k not in ("step", "registered", "version")}
+    facts = {k: v for k, v in result.items() if k not in ("step", "registered", "lacking", "version")}
     return {
         "format": 1,
         "copied": copied,
