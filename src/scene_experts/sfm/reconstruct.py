@@ -146,7 +146,8 @@ def run_features(
     model = Path(request["model"])
     again = {**request, "maps": str(folder / "maps" / "learned"), "model": str(folder / "maps" / "learned-model")}
     some = attempt.choose_pairs(pairs, spare, shots.names, result["lacking"])
-    return attempt.keep_better(result, attempt.reconstruct_with(shots, some, again, run, say, progress), (model, Path(again["model"])), say)
+    other = attempt.reconstruct_with(shots, some, again, run, say, progress)
+    return attempt.keep_better(result, other, len(shots.names), (model, Path(again["model"])), say)
 
 
 def check_request(source: Path, out: Path, overwrite: bool) -> None:

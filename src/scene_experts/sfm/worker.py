@@ -145,10 +145,11 @@ def add_learned(colmap: Any, ask: dict[str, Any]) -> None:
         for clear in (there.clear_matches, there.clear_two_view_geometries, there.clear_keypoints):
             clear()
         for image, places in new.items():
-            rows = np.zeros((len(places), old[image].shape[1]), np.float32)
+            before = old[image] if len(old[image]) else np.zeros((0, 6), np.float32)
+            rows = np.zeros((len(places), before.shape[1]), np.float32)
             rows[:, :2] = places
             rows[:, 2::3] = 1  # of scale 1: the diagonal of an affine shape (columns 2 and 5), or the third of four columns
-            there.write_keypoints(image, np.concatenate([old[image], rows]))
+            there.write_keypoints(image, np.concatenate([before, rows]))
         lines = []
         by_id = {image: name for name, image in ids.items()}
         for (one, other), parts in sorted(matches.items()):

@@ -19,6 +19,7 @@ from scene_experts.sfm.options import Features
 
 ENOUGH = 0.9  # fraction of photographs with a pose from the first mapper at which COLMAP's features suffice
 FEW = 30  # photographs of which all pairs are matched anew; of more, those with a photograph without a pose
+MOST = 3000  # pairs, unless asked for: nearly an hour of a core
 
 Worker = Callable[[dict[str, Any]], dict[str, Any]]
 """Runs COLMAP for a request and returns its last message."""
@@ -42,7 +43,7 @@ def is_wanted(features: Features, result: dict[str, Any], total: int, say: Calla
         return False
     left = f"the first mapper left {lacking} of {total} photographs without a pose"
     if find_weights() is None:
-        say(f"{left}; learned features may connect them: {INSTALL}, then repeat this with --overwrite")
+        say(f"{left}; learned features may connect them: {INSTALL}, then make the capture anew")
         return False
     say(f"{left}; learned features (ALIKED and LightGlue) are tried too, and the better result is kept")
     return True
@@ -52,9 +53,15 @@ def choose_pairs(
     pairs: Sequence[tuple[int, int]], spare: Sequence[tuple[int, int]], names: Sequence[str], lacking: Sequence[str]
 ) -> list[tuple[int, int]]:
     """Return the pairs that are matched by learned features, of those that COLMAP has matched: all of
-    few photographs, otherwise those with a photograph in `lacking`."""
-    every, without = sorted({*pairs, *spare}), set(lacking)
-    return every if len(names) <= FEW else [pair for pair in every if without.intersection(names[i] for i in pair)]
+    few photographs, otherwise those with a photograph in `lacking`. Of more than MOST, those in
+    `spare` are left out, and of the others MOST are taken, evenly spread."""
+    if len(names) <= FEW:
+        return sorted({*pairs, *spare})
+    without = set(lacking)
+    some = [pair for pair in sorted({*pairs, *spare}) if without.intersection(names[i] for i in pair)]
+    if len(some) > MOST:
+        some = sorted({*some}.intersection(pairs))
+    return some if len(some) <= MOST else [some[k * len(some) // MOST] for k in range(MOST)]
 
 
 def reconstruct_with(
@@ -71,7 +78,7 @@ def reconstruct_with(
     Raises InputError if the weights are missing or damaged, RunError if COLMAP fails.
     """
     finder, matcher = load_networks()
-    say(f"learned features: {len(pairs):,} pairs to match")
+    say(f"learned features: {len(pairs):,} pairs to match, about a second of a core each")
     photographs.find_features(shots, finder, progress)
     photographs.find_matches(shots, pairs, matcher, progress)
     arrays = shots.folder / "all.npz"
@@ -79,12 +86,18 @@ def reconstruct_with(
     return run({**request, "learned": str(arrays), "names": list(shots.names), "poses": True})
 
 
-def keep_better(one: dict[str, Any], other: dict[str, Any], models: tuple[Path, Path], say: Callable[[str], None]) -> dict[str, Any]:
-    """Return the result with more poses, then with more points: `one` of COLMAP's features or
-    `other`, with learned ones. Its model is moved to the first of the `models`."""
+def keep_better(
+    one: dict[str, Any], other: dict[str, Any], total: int, models: tuple[Path, Path], say: Callable[[str], None]
+) -> dict[str, Any]:
+    """Return the result that is kept: `one` of COLMAP's features or `other`, with learned ones. Its
+    model is moved to the first of the `models`.
+
+    Learned keypoints are less precise, so `other` needs more poses than the first mapper found for
+    `one`, and as many as its second. total: Number of photographs.
+    """
     poses = [(len(result["registered"]), result.get("points", 0)) for result in (one, other)]
     say("poses: " + ", ".join(f"{count} with {points:,} points from {what}" for (count, points), what in zip(poses, KINDS, strict=True)))
-    if poses[1] <= poses[0]:
+    if poses[1][0] <= total - len(one["lacking"]) or poses[1][0] < poses[0][0]:
         say("the result without learned features is kept")
         return one
     say("the result with learned features is kept")

@@ -1,5 +1,7 @@
 """When learned features are tried, and which result is kept."""
 
+from pathlib import Path
+
 import pytest
 
 from scene_experts.core.errors import InputError
@@ -40,20 +42,36 @@ def test_of_many_photographs_those_without_a_pose_are_matched():
     pairs, spare = [(0, 1), (1, 2), (3, 4)], [(2, 5), (6, 7)]
     assert attempt.choose_pairs(pairs, spare, names, ["2.jpg"]) == [(1, 2), (2, 5)]
     assert attempt.choose_pairs(pairs, spare, names[:8], ["2.jpg"]) == sorted([*pairs, *spare])
+    many = [(i, j) for i in range(99) for j in range(i + 1, 99)]
+    names = [f"{i}.jpg" for i in range(99)]
+    assert attempt.choose_pairs(many[:2000], many[2000:], names, names) == many[:2000]
+    some = attempt.choose_pairs(many, [], names, names)
+    assert len(some) == attempt.MOST and {i for pair in some for i in pair} == set(range(99))
 
 
-def test_the_better_result_is_kept_with_its_model(tmp_path):
-    models = (tmp_path / "model", tmp_path / "other")
-    for better, kept in (({"registered": list("abcdef"), "points": 678}, "other"), ({"registered": list("abcde"), "points": 999}, "model")):
-        for model in models:
-            model.mkdir(exist_ok=True)
-            (model / "of").write_text(model.name)
-        said = []
-        result = attempt.keep_better(POOR, better, models, said.append)
-        assert (models[0] / "of").read_text() == kept and ("features" in result) == (kept == "other")
-        assert "112" in said[0] and f"{better['points']}" in said[0]
-    nothing = attempt.keep_better({"registered": []}, {"registered": []}, models, said.append)
-    assert nothing == {"registered": []}
+@pytest.mark.parametrize(
+    ("lacking", "posed", "kept"),
+    [
+        ("cdef", "abcdef", "other"),  # as many poses as the second mapper's, which are not trusted
+        ("cdef", "abcde", "model"),
+        ("", "abcdef", "model"),  # no more poses than the first mapper's, which are more precise
+        ("ef", "abcdef", "other"),
+    ],
+)
+def test_the_better_result_is_kept_with_its_model(tmp_path, lacking, posed, kept):
+    models, said = (tmp_path / "model", tmp_path / "other"), []
+    for model in models:
+        model.mkdir()
+        (model / "of").write_text(model.name)
+    one, other = {**POOR, "lacking": list(lacking)}, {"registered": list(posed), "points": 678}
+    result = attempt.keep_better(one, other, 6, models, said.append)
+    assert (models[0] / "of").read_text() == kept and ("features" in result) == (kept == "other")
+    assert "112" in said[0] and "678" in said[0]
+
+
+def test_two_failures_stay_one():
+    nothing = {"registered": [], "lacking": list("abc")}
+    assert attempt.keep_better(nothing, nothing, 3, (Path("a"), Path("b")), lambda _: None) is nothing
 
 
 def test_matches_of_the_networks_reach_colmap(tmp_path, installed, monkeypatch):
