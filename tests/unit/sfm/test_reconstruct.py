@@ -15,6 +15,7 @@ from PIL import Image
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.sfm import reconstruct as run
 from scene_experts.sfm.learned import attempt
+from scene_experts.sfm.learned.weights import find_weights
 from scene_experts.sfm.options import SfmOptions
 from scene_experts.sfm.pairs import MOST_EXHAUSTIVE
 from scene_experts.sfm.reconstruct import LOG, NOTE
@@ -41,6 +42,24 @@ def aligned(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 def centres(capture, names) -> torch.Tensor:
     by_name = {view.name: view.camera.to(dtype=torch.float64).position for view in capture.views}
     return torch.stack([by_name[name] for name in names])
+
+
+@pytest.mark.slow
+@pytest.mark.foreign
+def test_learned_features_reach_colmap_and_give_poses_that_are_known(tmp_path, monkeypatch):
+    monkeypatch.setattr(attempt, "find_weights", find_weights)
+    if importlib.util.find_spec("pycolmap") is None or find_weights() is None:
+        pytest.skip("pycolmap or the weights of ALIKED and LightGlue are not installed")
+    source, out, names = tmp_path / "photos", tmp_path / "capture", TOGETHER[:5]
+    source.mkdir()
+    for name in names:
+        shutil.copy(BUDDHA / "images" / name, source / name)
+    note = run.reconstruct(source, out, SfmOptions(max_side=320, threads=2, features="learned"), say=lambda _: None)
+    assert note["with_pose"] == 5 and note["features"] == "SIFT and ALIKED"
+    made, known = load(out, split="none", normalise="none"), load(BUDDHA, split="none", normalise="none")
+    theirs = centres(known, names)
+    off = (aligned(centres(made, names), theirs) - theirs).norm(dim=1)
+    assert off.max() < 0.03 * torch.cdist(theirs, theirs).max(), off
 
 
 @pytest.mark.slow

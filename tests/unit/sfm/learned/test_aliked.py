@@ -22,7 +22,7 @@ def test_shapes_of_the_layers_and_the_number_of_weights():
     assert [tuple(x.shape) for x in features.levels] == [(32, 96, 128), (32, 48, 64), (32, 12, 16), (32, 3, 4)]
     assert scores.shape == (96, 128) and scores.min() > 0 and scores.max() < 1
     trained = [shape for name, shape in tensor_shapes().items() if "running" not in name and "num_batches" not in name]
-    assert abs(sum(torch.Size(shape).numel() for shape in trained) - 677_000) < 2_000  # 0.677 million in the paper's table of ALIKED-N(16)
+    assert abs(sum(torch.Size(shape).numel() for shape in trained) - 677_000) < 2_000  # 0.677 million, as the paper says
 
 
 def test_scores_are_those_of_the_joined_features():

@@ -32,7 +32,7 @@ def shots(tmp_path, name="work", threads=1, masks=None, max_side=64):
 
 @pytest.fixture(autouse=True)
 def few(monkeypatch):
-    monkeypatch.setattr(photographs, "MOST", 40)
+    monkeypatch.setattr(photographs, "MOST", 24)
 
 
 def test_results_are_the_same_at_any_number_of_threads_and_after_an_interruption(tmp_path):
@@ -40,17 +40,17 @@ def test_results_are_the_same_at_any_number_of_threads_and_after_an_interruption
     for name, threads in (("one", 1), ("three", 3)):
         there = shots(tmp_path, name, threads)
         find_features(there, FINDER, lambda *a: steps.append(a))
-        find_matches(there, PAIRS, MATCHER, lambda *a: steps.append(a))
-        write_for_colmap(there, PAIRS, tmp_path / f"{name}.npz")
+        find_matches(there, PAIRS[:2], MATCHER, lambda *a: steps.append(a))
+        write_for_colmap(there, PAIRS[:2], tmp_path / f"{name}.npz")
     one, three = np.load(tmp_path / "one.npz"), np.load(tmp_path / "three.npz")
     assert one.files == three.files and all(np.array_equal(one[key], three[key]) for key in one.files)
-    assert torch.get_num_threads() == before and ("learned features", 3, 3) in steps and ("learned matches", 3, 3) in steps
-    assert one["k0"].dtype == np.float32 and 5 < len(one["k0"]) <= 40 and one["pairs"].shape[1] == 2
+    assert torch.get_num_threads() == before and ("learned features", 3, 3) in steps and ("learned matches", 2, 2) in steps
+    assert one["k0"].dtype == np.float32 and 5 < len(one["k0"]) <= 24 and one["pairs"].shape[1] == 2
     there.matches(0, 1).unlink()
     steps.clear()
     find_features(there, None, lambda *a: steps.append(a))  # type: ignore[arg-type]  # all are there: the network is not needed
-    find_matches(there, PAIRS, MATCHER, lambda *a: steps.append(a))
-    assert steps == [("learned features", 3, 3), ("learned matches", 2, 3), ("learned matches", 3, 3)]
+    find_matches(there, PAIRS[:2], MATCHER, lambda *a: steps.append(a))
+    assert steps == [("learned features", 3, 3), ("learned matches", 1, 2), ("learned matches", 2, 2)]
 
 
 def test_places_are_in_pixels_of_the_whole_photograph(tmp_path):
