@@ -146,7 +146,11 @@ def run_features(
     model = Path(request["model"])
     again = {**request, "maps": str(folder / "maps" / "learned"), "model": str(folder / "maps" / "learned-model")}
     some = attempt.choose_pairs(pairs, spare, shots.names, result["lacking"])
-    other = attempt.reconstruct_with(shots, some, again, run, say, progress)
+    try:
+        other = attempt.reconstruct_with(shots, some, again, run, say, progress)
+    except (InputError, RunError) as error:
+        say(f"warning: the result without learned features is kept, because they failed: {error}")
+        return result
     return attempt.keep_better(result, other, len(shots.names), (model, Path(again["model"])), say)
 
 

@@ -330,3 +330,14 @@ def test_where_colmaps_features_suffice_nothing_else_runs(tmp_path, monkeypatch,
     monkeypatch.setattr(run, "run_worker", worker)
     note = make(write_black(tmp_path / "photos"), tmp_path / "out")
     assert not networks and len(worker.requests) == 1 and "features" not in note
+
+
+def test_poses_of_colmaps_features_are_kept_where_the_networks_fail(tmp_path, monkeypatch, networks):
+    def absent():
+        raise InputError("weights of another version")
+
+    monkeypatch.setattr(attempt, "load_networks", absent)
+    monkeypatch.setattr(run, "run_worker", fake_worker(**FOUND, lacking=["1.jpg", "2.jpg"]))
+    said = []
+    note = run.reconstruct(write_black(tmp_path / "photos"), tmp_path / "out", SfmOptions(), say=said.append)
+    assert note["with_pose"] == 2 and "features" not in note and any("weights of another version" in line for line in said)
