@@ -199,8 +199,8 @@ def formats() -> dict[str, tuple[Any, Callable[[Path, int, int], None], Callable
     """Return the budget, the writer and the reader of each format."""
     from scene_experts.core.reading import budget
     from scene_experts.core.reading.plain import read_json
+    from scene_experts.core.reading.torch_archive import read_tensors
     from scene_experts.files.anchors import compact
-    from scene_experts.files.archive.torch_archive import read_tensors
     from scene_experts.files.formats import glb, sog, spz
 
     return {

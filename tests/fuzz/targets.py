@@ -21,6 +21,7 @@ from fuzz.mutate import mutate, mutate_json
 from fuzz.structure import mutate_structure
 from scene_experts.core import checkpoint
 from scene_experts.core.io import write_json
+from scene_experts.core.reading.torch_archive import read_tensors
 from scene_experts.data import capture
 from scene_experts.data.images import FrameSource, decode, probe
 from scene_experts.data.lens import Lens
@@ -33,7 +34,6 @@ from scene_experts.files import registry, result_folder
 from scene_experts.files.anchors import compact, live, torchscript
 from scene_experts.files.anchors.read import read_folder
 from scene_experts.files.anchors.write import contents, describe
-from scene_experts.files.archive.torch_archive import read_tensors
 from scene_experts.files.formats.spz import spz_bytes
 from scene_experts.report import page
 from scene_experts.reproduce import store

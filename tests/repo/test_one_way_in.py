@@ -37,7 +37,7 @@ ALLOWED = {  # file: why it may open files by itself
     "sfm/frames.py": "the pipe of ffmpeg",
     "sfm/masks.py": "the masks that it has just written",
     "sfm/reconstruct.py": "notes and messages of its own processes",
-    "sfm/worker.py": "messages of the process that started it",
+    "sfm/worker.py": "messages and arrays of the process that started it",
     "training/memory.py": "/proc",
     "training/record.py": "the metrics of the run itself",
 }

@@ -61,6 +61,7 @@ def diagnose() -> list[Check]:
         "cores": machine,
         "memory": memory,
         "LPIPS weights": lpips,
+        "learned features": learned,
         **{name: partial(extra, name) for name in EXTRAS},
     }
     return [_guarded(name, check) for name, check in checks.items()]
@@ -189,6 +190,14 @@ def lpips() -> Check:
         return Check("LPIPS weights", True, f"found for VGG and AlexNet (kept in {weights.cache_dir()})")
     why = "; ".join(reason.removesuffix(f": {weights.HOW}") for reason in reasons.values())
     return Check("LPIPS weights", False, f"{why}; scores are written without them", weights.HOW)
+
+
+def learned() -> Check:
+    from scene_experts.sfm.learned.weights import INSTALL, find_weights
+
+    folder = find_weights()
+    what = "weights of ALIKED and LightGlue, for photographs that COLMAP's features do not connect (capture)"
+    return Check("learned features", folder is not None, f"{what}: {folder or 'not installed'}", f"run `{INSTALL}`")
 
 
 def extra(name: str) -> Check:

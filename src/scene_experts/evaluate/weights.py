@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-import importlib.util
 import os
 import pickle
 from collections.abc import Callable, Iterator
@@ -25,6 +24,7 @@ import torch
 from torch import Tensor
 
 from scene_experts.core.errors import InputError, RunError, few
+from scene_experts.core.extras import find_package_folders
 from scene_experts.core.io import cache_dir, write_atomic
 from scene_experts.core.progress import ByteProgress
 from scene_experts.core.reading.budget import WEIGHTS
@@ -186,17 +186,6 @@ def _find_linear(net: str, *folders: Path) -> Path | None:
         if path.is_file() and path.stat().st_size < 1 << 20 and sha256(path) == LINEAR_FILES[net][1]:
             return path
     return None
-
-
-def find_package_folders(package: str, *parts: str) -> list[Path]:
-    """Return the folders `parts` of an installed top-level package that exist. The package is not
-    imported."""
-    try:
-        spec = importlib.util.find_spec(package)
-    except (ImportError, ValueError):
-        return []
-    roots = (spec.submodule_search_locations if spec else None) or []
-    return [folder for root in roots if (folder := Path(root).joinpath(*parts)).is_dir()]
 
 
 def cache_path(net: str) -> Path:

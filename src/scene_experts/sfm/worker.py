@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sys
 import tempfile
 import threading
@@ -145,10 +146,55 @@ def match_pairs(colmap: Any, ask: dict[str, Any], pairs: list[list[str]]) -> Non
         report(step="matches", done=first + len(some), total=len(pairs))
 
 
+def add_learned(colmap: Any, ask: dict[str, Any]) -> None:
+    """Copy the database to ask["database"], and add the keypoints and matches of the npz file
+    ask["learned"] to those that COLMAP has found and verified. All are verified together."""
+    import numpy as np  # pycolmap loads it anyway
+
+    report(step="matches of both kinds", done=0, total=1)
+    shutil.copyfile(ask["database"], ask["database"] + ".learned")
+    ask["database"] += ".learned"
+    with np.load(ask["learned"], allow_pickle=False) as more, colmap.Database.open(ask["database"]) as there:
+        ids = {image.name: image.image_id for image in there.read_all_images()}
+        new = {ids[name]: more[f"k{i}"] for i, name in enumerate(ask["names"]) if name in ids}
+        old = {image: there.read_keypoints(image) for image in new}
+        matches: dict[tuple[int, int], list[Any]] = {}
+        for key, geometry in zip(*there.read_two_view_geometries()):
+            matches[tuple(colmap.pair_id_to_image_pair(key))] = [geometry.inlier_matches]
+        for p, pair in enumerate(more["pairs"].tolist()):
+            one, other = (ids.get(ask["names"][i]) for i in pair)
+            if one is not None and other is not None:
+                found = more[f"m{p}"] + np.array([len(old[one]), len(old[other])], np.uint32)
+                found = found if one < other else found[:, ::-1]
+                matches.setdefault((min(one, other), max(one, other)), []).append(found)
+        for clear in (there.clear_matches, there.clear_two_view_geometries, there.clear_keypoints):
+            clear()
+        for image, places in new.items():
+            before = old[image] if len(old[image]) else np.zeros((0, 6), np.float32)
+            rows = np.zeros((len(places), before.shape[1]), np.float32)
+            rows[:, :2] = places
+            rows[:, 2::3] = 1  # of scale 1: the diagonal of an affine shape (columns 2 and 5), or the third of four columns
+            there.write_keypoints(image, np.concatenate([before, rows]))
+        lines = []
+        by_id = {image: name for name, image in ids.items()}
+        for (one, other), parts in sorted(matches.items()):
+            there.write_matches(one, other, np.concatenate(parts).astype(np.uint32))
+            lines.append(f"{by_id[one]} {by_id[other]}\n")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "pairs.txt"
+        path.write_text("".join(lines))
+        options = colmap.TwoViewGeometryOptions()
+        options.ransac.random_seed = ask["seed"]  # for each pair: the order in which threads take pairs does not matter
+        colmap.verify_matches(ask["database"], str(path), options)
+    report(step="matches of both kinds", done=1, total=1)
+
+
 def estimate_poses(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
-    """Reconstruct the scene, write the best model and return a description of it."""
+    """Reconstruct the scene, write the best model and return a description of it. Its `lacking` are
+    the photographs that the incremental mapper, or the only one, gave no pose."""
     total = sum(map(len, ask["groups"]))
     found: list[tuple[str, Any]] = []
+    first: set[str] = set()
     tried: dict[str, int] = {}
     for mapper in ("incremental", "global") if ask["mapper"] == "auto" else (ask["mapper"],):
         out = Path(ask["maps"]) / mapper
@@ -162,12 +208,15 @@ def estimate_poses(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
             continue
         found += [(mapper, model) for model in models.values()]
         tried[mapper] = max((model.num_reg_images() for model in models.values()), default=0)
+        if len(tried) == 1 and models:
+            first = registered_names(max(models.values(), key=lambda model: model.num_reg_images()))
         if tried[mapper] >= ENOUGH * total:
             break
         if mapper != ask["mapper"] and len(tried) == 1:
             report(step="next mapper", mapper=mapper, posed=tried[mapper], photographs=total, parts=len(models))
+    lacking = sorted({name for group in ask["groups"] for name in group} - first)
     if not found:
-        return {"registered": []}
+        return {"registered": [], "lacking": lacking}
     mapper, best = max(found, key=lambda one: (one[1].num_reg_images(), one[1].num_points3D()))
     os.makedirs(ask["model"])
     best.write_binary(ask["model"])
@@ -177,6 +226,7 @@ def estimate_poses(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
         "mapper": mapper,
         "mappers": tried,
         "registered": sorted(have),
+        "lacking": lacking,
         "why": explain_missing(colmap, ask, have, set().union(*others)),
         "apart": sorted(map(len, filter(None, others)), reverse=True),
         "points": best.num_points3D(),
@@ -289,14 +339,18 @@ def main() -> int:
         return 0
     threading.Thread(target=exit_with_parent, daemon=True).start()
     colmap.set_random_seed(ask["seed"])
-    extract_features(colmap, ask)
-    if ask["pairs"] is None:  # asked for the features alone
+    if ask["learned"]:
+        add_learned(colmap, ask)
+    else:
+        extract_features(colmap, ask)
+        if ask["pairs"] is not None:
+            match_all(colmap, ask)
+    if not ask["poses"]:
         report(step="done")
         sys.stdout.flush()
         os._exit(0)
     if ask["rig"] is not None:
         tie_views(colmap, ask)
-    match_all(colmap, ask)
     report(step="done", version=colmap.__version__, **estimate_poses(colmap, ask))
     sys.stdout.flush()
     os._exit(0)  # the waiting thread would delay the end of the interpreter

@@ -26,6 +26,7 @@ NAMES = [
     "cores",
     "memory",
     "LPIPS weights",
+    "learned features",
     *doctor.EXTRAS,
 ]
 

@@ -130,17 +130,6 @@ def test_arrays_are_read(tmp_path: Path, protocol: int) -> None:
     assert np.array_equal(weights.read_arrays(tmp_path / "x")["a"]["b"], tree["a"]["b"])
 
 
-def test_packages_are_not_imported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.undo()
-    package = tmp_path / "lpips_probe"
-    (package / "weights").mkdir(parents=True)
-    (package / "__init__.py").write_text("raise RuntimeError('imported')")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    assert weights.find_package_folders("lpips_probe", "weights") == [package / "weights"]
-    assert weights.find_package_folders("lpips_probe", "other") == []
-    assert weights.find_package_folders("no_such_package_here", "weights") == []
-
-
 def test_weights_are_downloaded_and_only_what_is_needed_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     backbone, linear = write_torch(tmp_path / "published")
     publish(monkeypatch, weights.BACKBONE_FILES, backbone)

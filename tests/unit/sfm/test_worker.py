@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from scene_experts.sfm import worker
@@ -16,14 +17,14 @@ from scene_experts.sfm import worker
 SOURCE = Path(worker.__file__)
 
 
-def test_the_worker_imports_only_pycolmap_and_the_standard_library():
+def test_the_worker_imports_only_pycolmap_numpy_and_the_standard_library():
     found = set()
     for node in ast.walk(ast.parse(SOURCE.read_text())):
         if isinstance(node, ast.Import):
             found |= {alias.name.split(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             found.add((node.module or "").split(".")[0])
-    assert found - set(sys.stdlib_module_names) - {"__future__"} == {"pycolmap"}
+    assert found - set(sys.stdlib_module_names) - {"__future__"} == {"pycolmap", "numpy"}  # pycolmap loads numpy
 
 
 def test_a_missing_pycolmap_is_reported(tmp_path):
@@ -95,12 +96,12 @@ def test_the_second_mapper_is_tried_if_the_first_leaves_many_out(reconstruct, ca
     assert found["apart"] == [1]  # only j of the second model is in no other model
     ran, written, found = reconstruct(["abcd"], ["abcdefg"])
     assert ran == ["incremental", "global"] and written == ["abcdefg"] and found["mapper"] == "global" and found["apart"] == []
-    assert found["mappers"] == {"incremental": 4, "global": 7}
+    assert found["mappers"] == {"incremental": 4, "global": 7} and found["lacking"] == list("efghij")
     assert json.loads(capsys.readouterr().out.splitlines()[-2])["posed"] == 4  # said before the second mapper starts
     ran, written, found = reconstruct(["abcd"], None)
     assert written == ["abcd"] and found["mapper"] == "incremental"
     ran, written, found = reconstruct([], [], mapper="global")
-    assert ran == ["global"] and not written and found == {"registered": []}
+    assert ran == ["global"] and not written and found == {"registered": [], "lacking": list("abcdefghij")}
 
 
 def test_why_a_photograph_has_no_pose():
@@ -166,3 +167,43 @@ def test_the_worker_ends_when_its_parent_ends(tmp_path):
     assert "here" in said
     assert parent.stdout.read() == ""  # returns when the worker, which holds the other end, ends
     parent.wait()
+
+
+def test_learned_matches_are_added_to_those_that_colmap_verified(tmp_path, monkeypatch):
+    """Photographs 1 and 2 have matches of both kinds, 2 and 3 learned ones alone, given in the other order."""
+    written = {}
+
+    class Database:
+        @staticmethod
+        @contextmanager
+        def open(path):
+            written["path"] = path
+            yield Database
+
+        read_all_images = staticmethod(lambda: [SimpleNamespace(image_id=i, name=f"{i}.jpg") for i in (1, 2, 3)])
+        read_keypoints = staticmethod(lambda i: np.full((i % 3, {1: 4, 2: 6, 3: 0}[i]), 9, np.float32))  # the third has none
+        read_two_view_geometries = staticmethod(lambda: ([(1, 2)], [SimpleNamespace(inlier_matches=np.array([[0, 1]], np.uint32))]))
+        write_keypoints = staticmethod(lambda i, rows: written.update({i: rows}))
+        write_matches = staticmethod(lambda i, j, rows: written.update({(i, j): rows.tolist()}))
+        clear_matches = clear_two_view_geometries = clear_keypoints = staticmethod(lambda: None)
+
+    def verify(path, pairs, options):
+        written["pairs"], written["seed"] = Path(pairs).read_text().splitlines(), options.ransac.random_seed
+
+    colmap = SimpleNamespace(
+        Database=Database,
+        pair_id_to_image_pair=lambda key: key,
+        verify_matches=verify,
+        TwoViewGeometryOptions=lambda: SimpleNamespace(ransac=SimpleNamespace(random_seed=-1)),
+    )
+    (tmp_path / "db").write_bytes(b"database")
+    places = {f"k{i}": np.array([[5.0 + i, 6.0], [7.0, 8.0]], np.float32) for i in range(3)}
+    more = {"pairs": np.array([[0, 1], [2, 1]]), "m0": np.array([[1, 0]], np.uint32), "m1": np.array([[0, 1]], np.uint32)}
+    np.savez(tmp_path / "all.npz", **places, **more)
+    ask = {"database": str(tmp_path / "db"), "learned": str(tmp_path / "all.npz"), "names": ["1.jpg", "2.jpg", "3.jpg"], "seed": 4}
+    worker.add_learned(colmap, ask)
+    assert written["path"] == ask["database"] == str(tmp_path / "db.learned") and (tmp_path / "db").read_bytes() == b"database"
+    assert written[1].tolist() == [[9, 9, 9, 9], [5, 6, 1, 0], [7, 8, 1, 0]]
+    assert written[2][2:].tolist() == [[6, 6, 1, 0, 0, 1], [7, 8, 1, 0, 0, 1]]  # behind the two of COLMAP
+    assert written[1, 2] == [[0, 1], [1 + 1, 2 + 0]] and written[2, 3] == [[2 + 1, 0]] and len(written[3]) == 2
+    assert written["pairs"] == ["1.jpg 2.jpg", "2.jpg 3.jpg"] and written["seed"] == 4

@@ -108,3 +108,6 @@ RUN = Budget("run folder", 1 << 60, advice="restore its files or train again")
 CHECKPOINT = Budget("checkpoint", 1 << 40, items=100_000, advice="use an older one or copy it again")
 NETWORK = Budget("network file", 16 * GIB, floor=128 * MIB, ratio=4, items=200_000, depth=50, advice="get it again")
 WEIGHTS = Budget("file of LPIPS weights", 4 * GIB, ratio=4, items=1_000, advice="remove the file and get it again")
+FEATURES = Budget(
+    "file of features", 64 * MIB, ratio=4, items=100, advice="remove the folder .capture of the capture and repeat the command"
+)

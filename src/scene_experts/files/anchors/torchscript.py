@@ -18,8 +18,8 @@ from torch import Tensor, nn
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_bytes
+from scene_experts.core.reading import torch_archive
 from scene_experts.files.anchors.data import Network
-from scene_experts.files.archive import torch_archive
 
 FILES = {"opacity": "opacity_mlp.pt", "cov": "cov_mlp.pt", "color": "color_mlp.pt"}
 EXTRA_FILES = {"feature_bank": "feature_bank_mlp.pt", "appearance": "embedding_appearance.pt"}

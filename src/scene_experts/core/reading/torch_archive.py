@@ -17,12 +17,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from scene_experts.core.errors import InputError
+from scene_experts.core.errors import InputError, few
 from scene_experts.core.reading.archives import Archive, open_zip
 from scene_experts.core.reading.budget import NETWORK
 from scene_experts.core.reading.numbers import expect_finite_tensors
+from scene_experts.core.reading.pickle_data import Global, NotData, ObjectRecord, Outside, decode
 from scene_experts.core.reading.source import opening, shorten
-from scene_experts.files.archive.pickle_data import Global, NotData, ObjectRecord, Outside, decode
 
 _STORAGES = {
     "FloatStorage": torch.float32, "DoubleStorage": torch.float64, "HalfStorage": torch.float16, "BFloat16Storage": torch.bfloat16,
@@ -53,6 +53,20 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
                 f"expected nothing but tensors in {path}, found otherwise: {error}; do not use this file, get it again"
             ) from None
     return found
+
+
+def read_known_tensors(path: Path, wanted: dict[str, tuple[int, ...]], advice: str) -> dict[str, Tensor]:
+    """The tensors of a file whose names and shapes are `wanted`, floats as float32.
+
+    advice: What the user can do where the file has others; it ends the sentence.
+
+    Raises InputError as `read_tensors` does, and for other names or shapes.
+    """
+    found = read_tensors(path)
+    shapes = {name: tuple(value.shape) for name, value in found.items()}
+    if odd := sorted(name for name in wanted.keys() | shapes.keys() if wanted.get(name) != shapes.get(name)):
+        raise InputError(f"expected {len(wanted)} tensors of known shapes in {path}, found differences in {few(odd)}; {advice}")
+    return {name: value.float() if value.is_floating_point() else value for name, value in found.items()}
 
 
 class _TensorReader:

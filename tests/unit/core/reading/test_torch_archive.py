@@ -10,8 +10,8 @@ import torch
 from torch import nn
 
 from scene_experts.core.errors import InputError
-from scene_experts.files.archive import pickle_data
-from scene_experts.files.archive.torch_archive import read_tensors
+from scene_experts.core.reading import pickle_data
+from scene_experts.core.reading.torch_archive import read_known_tensors, read_tensors
 from support.messages import naming
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning")
@@ -224,3 +224,13 @@ def test_a_hundred_bytes_that_name_a_list_a_billion_times(tmp_path):
         deep = [deep, deep]
     with pytest.raises(InputError, match=naming("200,000")):
         read_tensors(archive(tmp_path / "a.pt", pickle.dumps(deep, protocol=2)))
+
+
+def test_only_the_wanted_names_and_shapes_are_read(tmp_path):
+    path, wanted = tmp_path / "w.pth", {"a.weight": (2, 3), "count": ()}
+    torch.save({"a.weight": torch.arange(6.0).reshape(2, 3).half(), "count": torch.tensor(3)}, path)
+    found = read_known_tensors(path, wanted, "get version 1")
+    assert found["a.weight"].dtype == torch.float32 and found["a.weight"].flatten().tolist() == [0, 1, 2, 3, 4, 5] and found["count"] == 3
+    for odd in ({"a.weight": (2, 4), "count": ()}, {"a.weight": (2, 3)}, {**wanted, "b": (1,)}):
+        with pytest.raises(InputError, match=naming(path, "get version 1")):
+            read_known_tensors(path, odd, "get version 1")

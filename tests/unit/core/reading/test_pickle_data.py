@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scene_experts.files.archive import pickle_data
-from scene_experts.files.archive.pickle_data import Global, NotData, ObjectRecord, Outside, decode
+from scene_experts.core.reading import pickle_data
+from scene_experts.core.reading.pickle_data import Global, NotData, ObjectRecord, Outside, decode
 
 PLAIN = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
