@@ -19,6 +19,7 @@ from scene_experts.data import prepare
 from scene_experts.data.blocks import read_view_names
 from scene_experts.data.colour import find_white
 from scene_experts.data.copies import tell_copies
+from scene_experts.data.depth_maps import DepthView, find_points
 from scene_experts.data.images import FrameSource, check_policy, probe
 from scene_experts.data.lens import centre_principal_point, to_pinhole
 from scene_experts.data.masks import find_masks
@@ -117,9 +118,23 @@ def _read(data: Data, policy: str, cache_bytes: int | None) -> tuple[RawCapture,
     raw = replace(raw, warnings=warnings)
     if data.split in ("auto", "files"):
         raw = apply_lists(root, raw)
+    raw = _points_of_depths(raw, data)
     raw, omitted = _leave_out(root, raw, data.leave_out)
     capture = _assemble(root, reader.name, raw, data.ignore_principal_point, background, cache_bytes)
     return raw, replace(capture, omitted=omitted)
+
+
+def _points_of_depths(raw: RawCapture, data: Data) -> RawCapture:
+    """Return the capture with the points of its depth maps, where it has maps and no other
+    points."""
+    if raw.points is not None or data.points is not None or data.init == "random":
+        return raw
+    views = [DepthView(i.path, i.lens, i.world_to_cam, i.depth) for i in raw.images if i.lens is not None and i.depth is not None]
+    points = find_points(views)
+    if points is None:
+        return raw
+    note = f"the {len(points.xyz):,} points are those of {len(views)} depth maps; choose others with --points, or --init random"
+    return replace(raw, points=points, points_source="the depth maps", random_points=False, warnings=[*raw.warnings, note])
 
 
 def _leave_out(root: Path, raw: RawCapture, written: tuple[str, ...]) -> tuple[RawCapture, tuple[str, ...]]:

@@ -9,8 +9,12 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.reading.budget import CAPTURE
 from scene_experts.core.reading.numbers import shown
 from scene_experts.core.reading.source import guarding
+from scene_experts.data.depth_maps import DepthFile
 from scene_experts.data.readers import transforms
 from scene_experts.data.readers.reader import PosedImage, RawCapture, ReadOptions
+
+MILLI = 0.001
+"""Units of the capture for a step of a depth map, which nerfstudio takes unless told otherwise."""
 
 
 class NerfstudioReader:
@@ -41,6 +45,7 @@ class NerfstudioReader:
         images: list[PosedImage | None] = []
         names: list[str] = []
         unmasked: list[str] = []
+        undeep: list[str] = []
         for index, frame in enumerate(meta["frames"]):
             stated = transforms.read_file_path(frame, index, path)
             name, image = transforms.find_image(folder, stated, options.images)
@@ -52,10 +57,16 @@ class NerfstudioReader:
             angle = transforms.read_angle(meta, frame, path) if lens is None else 0.0
             pose = transforms.read_pose(frame, path)
             names.append(name)
-            images.append(image and PosedImage(name, image, lens, pose, mask, angle, transforms.to_pure(stated) in held))
+            depth = folder / str(frame["depth_file_path"]) if frame.get("depth_file_path") else None
+            if depth is not None and not depth.is_file():
+                undeep, depth = [*undeep, str(frame["depth_file_path"])], None
+            held_out, file = transforms.to_pure(stated) in held, None if depth is None else DepthFile(depth, MILLI)
+            images.append(image and PosedImage(name, image, lens, pose, mask, angle, held_out, file))
         kept = transforms.drop_absent(folder, images, names, warnings)
         if unmasked:
             warnings.append(f"{len(unmasked)} masks that transforms.json names are absent (first: {unmasked[0]}); restore them")
+        if undeep:
+            warnings.append(f"{len(undeep)} depth maps that transforms.json names are absent (first: {undeep[0]}); restore them")
         points, cloud = transforms.read_points(folder, meta.get("ply_file_path"), warnings) if options.points else (None, None)
         source = "the file that ply_file_path names, or pointcloud.ply,"
         return RawCapture(kept, points, warnings, points_source=source, cloud=cloud, applied=meta.get("applied_transform"))

@@ -15,11 +15,13 @@ from scene_experts.core.io import read_json
 from scene_experts.core.reading.budget import CAPTURE
 from scene_experts.core.reading.numbers import to_size
 from scene_experts.core.reading.source import describe, guarding
+from scene_experts.data.depth_maps import DepthFile
 from scene_experts.data.lens import Lens
 from scene_experts.data.readers import poses, transforms
 from scene_experts.data.readers.reader import RawCapture, ReadOptions
 
 _KINDS = ("corrected_", "")
+MILLIMETRE = 0.001  # in metres, the unit of the poses
 
 
 class PolycamReader:
@@ -45,7 +47,8 @@ class PolycamReader:
             files = sorted((place / f"{kind}cameras").glob("*.json"))
             warnings = [] if kind else ["the poses are those of the phone: Polycam has not written corrected ones"]
             posed = [_read_pose(path) for path in files]
-            return poses.assemble(folder, files[0].parent, posed, options, warnings, images=place / f"{kind}images")
+            depths = {pose.name: found for pose in posed if (found := _find_depth(place, pose.name)) is not None}
+            return poses.assemble(folder, files[0].parent, posed, options, warnings, images=place / f"{kind}images", depths=depths)
 
 
 def _find(folder: Path) -> tuple[Path, str] | None:
@@ -55,6 +58,12 @@ def _find(folder: Path) -> tuple[Path, str] | None:
             if (place / f"{kind}images").is_dir() and next((place / f"{kind}cameras").glob("*.json"), None) is not None:
                 return place, kind
     return None
+
+
+def _find_depth(place: Path, name: str) -> DepthFile | None:
+    """Return the depth map of a keyframe, in millimetres, if the phone has a LiDAR."""
+    depth, confidence = (place / kind / f"{name}.png" for kind in ("depth", "confidence"))
+    return DepthFile(depth, MILLIMETRE, confidence if confidence.is_file() else None) if depth.is_file() else None
 
 
 def _read_pose(path: Path) -> poses.Pose:

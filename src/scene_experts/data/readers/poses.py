@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
@@ -16,6 +16,7 @@ from scene_experts.core.reading.numbers import FARTHEST
 from scene_experts.core.reading.plain import decode_text
 from scene_experts.core.reading.source import opening, shorten
 from scene_experts.core.types import Points
+from scene_experts.data.depth_maps import DepthFile
 from scene_experts.data.images import Size, probe
 from scene_experts.data.lens import Lens
 from scene_experts.data.match import EXTENSIONS, absent_error, match_images, to_relative_name
@@ -70,6 +71,7 @@ def assemble(
     images: Path | None = None,
     points: Points | None = None,
     own_points: bool = False,
+    depths: Mapping[str, DepthFile] | None = None,
 ) -> RawCapture:
     """Return the capture of the poses in `path`: their photographs, masks and points.
 
@@ -77,6 +79,7 @@ def assemble(
         images: Folder of the photographs. None: `options.images`, else "images", else `folder`.
         points: The points that the file holds.
         own_points: Whether the format holds points. Otherwise a PLY file beside the poses does.
+        depths: Depth maps, by the names of their poses.
 
     Raises InputError if photographs are absent (with `options.missing == "drop"`: if all are), and
     if two poses are of one.
@@ -107,14 +110,15 @@ def assemble(
                 lens, turned = pose.lens(header.size), pose.lens(header.turned)
             except InputError as error:
                 raise InputError(f"{shorten(pose.name)} in {path}: {error}") from None
-            posed.append(PosedImage(shown, file, lens, pose.world_to_cam, turned=None if turned == lens else turned))
+            depth = None if depths is None else depths.get(pose.name)
+            posed.append(PosedImage(shown, file, lens, pose.world_to_cam, depth=depth, turned=None if turned == lens else turned))
     cloud = None
     if options.points and not own_points:
         cloud = find_cloud(list(dict.fromkeys((path.parent, folder))), warnings) or _only_cloud(folder)
         if cloud is not None:
             points = read_points(cloud, warnings)
             warnings.append(f"the points are those of {cloud.name}; choose others with --points")
-        else:
+        elif not depths:
             warnings.append(f"{path.name} holds no points: put a PLY file beside it, or give one with --points")
     return RawCapture(posed, points, warnings, points_source=path.name, cloud=cloud, random_points=not own_points)
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_experts.core.types import Points
+from scene_experts.data.depth_maps import DepthFile
 from scene_experts.data.lens import Lens
 from scene_experts.data.views import Vector
 
@@ -36,6 +37,7 @@ class PosedImage:
     mask: Path | None = None  # file that the capture names as its mask; others are found by their names
     angle: float = 0.0  # horizontal field of view in radians, used if `lens` is None
     test: bool = False  # the files name it as a test view
+    depth: DepthFile | None = None  # its depth map
     turned: Lens | None = None  # the lens if the program has turned the photograph by its EXIF orientation, where the files do not say
 
 
