@@ -19,7 +19,7 @@ from scene_experts.data import prepare
 from scene_experts.data.blocks import read_view_names
 from scene_experts.data.colour import find_white
 from scene_experts.data.copies import tell_copies
-from scene_experts.data.depth_maps import DepthView, find_points
+from scene_experts.data.depth_maps import DepthPhoto, find_points
 from scene_experts.data.images import FrameSource, check_policy, probe
 from scene_experts.data.lens import centre_principal_point, to_pinhole
 from scene_experts.data.masks import find_masks
@@ -129,7 +129,7 @@ def _points_of_depths(raw: RawCapture, data: Data) -> RawCapture:
     points."""
     if raw.points is not None or data.points is not None or data.init == "random":
         return raw
-    views = [DepthView(i.path, i.lens, i.world_to_cam, i.depth) for i in raw.images if i.lens is not None and i.depth is not None]
+    views = [DepthPhoto(i.path, i.lens, i.world_to_cam, i.depth) for i in raw.images if i.lens is not None and i.depth is not None]
     points = find_points(views)
     if points is None:
         return raw

@@ -41,7 +41,7 @@ class DepthFile:
 
 
 @dataclass(frozen=True)
-class DepthView:
+class DepthPhoto:
     """A photograph with a depth map."""
 
     photograph: Path
@@ -50,7 +50,7 @@ class DepthView:
     depth: DepthFile
 
 
-def find_points(views: Sequence[DepthView]) -> Points | None:
+def find_points(views: Sequence[DepthPhoto]) -> Points | None:
     """Return at most MOST points of depth maps, in the frame of the cameras; None if no pixel is
     left. Raises InputError if a file is damaged or fits its photograph not."""
     each = max(1, PIXELS // max(len(views), 1))
@@ -68,7 +68,7 @@ def find_points(views: Sequence[DepthView]) -> Points | None:
     return Points(torch.from_numpy(places[chosen]), torch.from_numpy(colors[chosen].astype(np.uint8)))
 
 
-def read_points(view: DepthView, most: int) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.float64]]:
+def read_points(view: DepthPhoto, most: int) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.float64]]:
     """Return about `most` points [n, 3] of a depth map, their colours [n, 3] and depths [n]."""
     depth = read_depth(view.depth)
     height, width = depth.shape

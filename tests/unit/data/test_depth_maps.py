@@ -6,7 +6,7 @@ from PIL import Image
 
 from scene_experts.core.errors import InputError
 from scene_experts.data import depth_maps
-from scene_experts.data.depth_maps import DepthFile, DepthView, find_points, is_edge
+from scene_experts.data.depth_maps import DepthFile, DepthPhoto, find_points, is_edge
 from scene_experts.data.lens import Lens
 from scene_experts.data.readers.polycam import READER
 from scene_experts.data.readers.reader import ReadOptions
@@ -26,7 +26,7 @@ def write_view(folder, depth, lens=LENS, pose=None, confidence=None):
     if confidence is not None:
         Image.fromarray(confidence.astype(np.uint8)).save(folder / "sure.png")
     file = DepthFile(folder / "depth.png", 0.001, None if confidence is None else folder / "sure.png")
-    return DepthView(folder / "photo.png", lens, np.eye(4) if pose is None else pose, file)
+    return DepthPhoto(folder / "photo.png", lens, np.eye(4) if pose is None else pose, file)
 
 
 def project(points, view):
