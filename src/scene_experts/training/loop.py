@@ -16,30 +16,29 @@ from torch import Tensor
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.group import Alone
 from scene_experts.core.schedule import passes
-from scene_experts.core.types import Decoded, Mode, Render, Routing
+from scene_experts.core.types import Mode
 from scene_experts.data.capture import Capture
-from scene_experts.data.dense import NoDenseStartError, start_densely
 from scene_experts.render import Rasterizer, for_training
 from scene_experts.scene import Scene
 from scene_experts.scene.anchors.quantise import ROUNDED
-from scene_experts.strategy import Edit
 from scene_experts.strategy.survey import Survey, TrainingPhoto
 from scene_experts.training.batch import Direct, check_batch, make_exchange
 from scene_experts.training.config import RunConfig, Train, find_unused
 from scene_experts.training.direct import DirectStep
-from scene_experts.training.events import Densified, Event, Finished, Previewed, Saved, Started, Stepped, Stopped
+from scene_experts.training.events import Densified, Event, Finished, Previewed, Saved, Started, Stopped
 from scene_experts.training.guard import explain, find_broken
-from scene_experts.training.losses import Sample, compute_terms, load_dense, load_sparse
+from scene_experts.training.losses import Sample, compute_terms
+from scene_experts.training.measure import Iteration, measure_step
 from scene_experts.training.memory import anchor_cap, give_back, peak_bytes
 from scene_experts.training.options import TrainOptions
 from scene_experts.training.resident import AHEAD, Resident
 from scene_experts.training.sensitivity import MOST_VIEWS, evenly, find_sensitivity
 from scene_experts.training.shards import Sharded, check_shard
+from scene_experts.training.start import start
 from scene_experts.training.state import Training, resume, save
 from scene_experts.training.trial import fit_memory
 
 log: logging.Logger = logging.getLogger(__name__)
-ROUTED = 16_384  # anchors sampled for the routing statistics; the shares are within 0.5 % of those of all anchors
 
 
 @dataclass(frozen=True)
@@ -63,19 +62,6 @@ class Job:
     def max_memory(self) -> float:
         """GiB of memory at which densification stops; 0: no limit."""
         return self.config.max_memory
-
-
-@dataclass(frozen=True)
-class Iteration:
-    """Inputs and results of the last view of a batch that this process drew, and what densification
-    did after the batch."""
-
-    decoded: Decoded
-    render: Render
-    terms: Mapping[str, Tensor]  # by name, weighted; computed when they are read where autograd did not need them
-    target: Tensor  # [H, W, 3]
-    mask: Tensor | None  # [H, W]
-    edits: tuple[tuple[int, Edit], ...] = ()  # iteration and result of each densification step
 
 
 def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iterator[Event]:
@@ -180,34 +166,13 @@ def begin(cfg: Train, run: Job, capture: Capture, folder: Path | None, rasterize
         if training.step >= last_iteration(cfg, run):
             found = f"found {run.config.stop_at}; give a larger number or leave it out"
             raise InputError(f"expected --stop-at above {training.step}, where the run of --init-from ended, {found}")
-    training = training or start(cfg, run, capture)
+    training = training or start(cfg, run.config.data, capture, run.device, run.dtype)
     if unused := find_unused(cfg):
         log.warning("these options have no effect with this recipe: %s; leave them out", ", ".join(unused))
     training.capture_id, training.poses, training.chosen = capture.fingerprint(), capture.poses(), capture.chosen()
     training.scene.set_training_cameras([capture.views[i].camera for i in capture.train])
     if run.max_memory > 0:
         fit_memory(training, run.max_memory, capture, lambda *view: see_view(training, run, capture, rasterize, *view))
-    return training
-
-
-def start(cfg: Train, run: Job, capture: Capture) -> Training:
-    """Start a training from the capture's points, or with --init dense, and with few views where the
-    recipe asks for it, from those of `data.dense`. `cfg` must be scaled. Raises InputError as
-    `train`."""
-    data = run.config.data
-    by_recipe = data.init == "auto" and data.points is None and not capture.random_points and len(capture.train) <= cfg.dense_views
-    if data.init != "dense" and not by_recipe:
-        return Training.start(cfg, capture, run.device, run.dtype)
-    try:
-        found = start_densely(capture, cfg.growth.max_anchors)
-    except NoDenseStartError as error:
-        if not by_recipe:
-            raise
-        training = Training.start(cfg, capture, run.device, run.dtype)
-        training.computed = f"the capture's points; a plane sweep finds no denser ones: it needs {error.expected} and found {error.why}"
-        return training
-    training = Training.start(cfg, replace(capture, points=found.points), run.device, run.dtype)
-    training.computed = found.describe() + ("; --init points starts from the capture's own" if by_recipe else "")
     return training
 
 
@@ -391,44 +356,6 @@ def check_finite(step: int, parts: Mapping[str, Tensor]) -> None:
             f"expected finite losses, found {', '.join(bad)} = {float(parts[bad[0]])} at iteration {step}; "
             "the last checkpoint is intact: look at the capture with `scene-experts info`, or lower the learning rates (--rates...)"
         )
-
-
-@torch.no_grad()
-def measure_step(training: Training, done: Iteration) -> Stepped:
-    """Compute the statistics of the last iteration."""
-    decoded = done.decoded
-    error = done.render.image.clamp(0, 1).sub_(done.target).square_()
-    mse = float(error.mean() if done.mask is None else (error.mean(2) * done.mask).sum() / done.mask.sum().clamp_min(1e-12))
-    raw = decoded.raw_opacity
-    balance, entropy = {}, {}
-    for attribute, r in decoded.routing.items():
-        A, E = r.gates.shape
-        balance[attribute] = float(load_dense(r.gates) if r.chosen is None else load_sparse(r.gates, r.chosen) / r.chosen.shape[1])
-        entropy[attribute] = float(torch.special.entr(r.gates).sum()) / max(A, 1) / math.log(E)
-    scene = training.scene.routing(training.step, ROUTED) if decoded.routing else {}
-    return Stepped(
-        step=training.step,
-        terms={k: float(v) for k, v in done.terms.items()},
-        psnr=-10.0 * math.log10(max(mse, 1e-10)),
-        anchors=training.scene.table.total,
-        visible=len(decoded.rows),
-        gaussians=len(decoded.gaussians),
-        active=float((raw > 0).float().mean()) if raw is not None and raw.numel() else 0.0,
-        seconds=training.clock.seconds,
-        routing={attribute: use(r) for attribute, r in decoded.routing.items()},
-        balance=balance,
-        entropy=entropy,
-        scene_routing={attribute: use(r) for attribute, r in scene.items()},
-        scene_gates={attribute: use(Routing(r.gates, None)) for attribute, r in scene.items()},
-    )
-
-
-def use(r: Routing) -> list[float]:
-    """Return each expert's share of the assignments, or its mean gate while routing is dense,
-    [E]."""
-    A, E = r.gates.shape
-    share = r.gates.sum(0) / max(A, 1) if r.chosen is None else torch.bincount(r.chosen.reshape(-1), minlength=E) / max(r.chosen.numel(), 1)
-    return [round(float(c), 4) for c in share]
 
 
 @torch.no_grad()

@@ -25,6 +25,7 @@ from scene_experts.render import Rasterizer
 from scene_experts.render.gsplat import GsplatRasterizer
 from scene_experts.scene import Scene
 from scene_experts.training import loop
+from scene_experts.training.measure import measure_step
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.training.state import Training
 from scene_experts.view.paint import paint
@@ -75,7 +76,7 @@ def try_recipe(capture: Capture, word: str) -> dict[str, Any]:
         found["bytes"], found["moved"], found["where"] = counts.bytes, counts.moved.most_common(40), counts.where.most_common(40)
         found["names"] = counts.kernels.most_common(25)
         found["sizes"] = [len(training.scene.table), len(done.decoded.rows), len(done.decoded.gaussians)]
-    loop.measure_step(training, done)
+    measure_step(training, done)
     loop.preview(training, run, capture, draw)
     saved = {name: t.detach().cpu().contiguous() for name, t in training.tensors().items()}
     again = Training.restore(cfg, saved, training.meta(), "cuda")

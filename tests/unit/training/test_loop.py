@@ -2,7 +2,6 @@
 
 import json
 import math
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,6 @@ from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.schedule import Every
 from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
-from scene_experts.native import library as native
 from scene_experts.render import choose
 from scene_experts.scene.anchors.experts import Experts
 from scene_experts.scene.anchors.scene import Anchors
@@ -22,14 +20,13 @@ from scene_experts.strategy.split_clone import SplitClone
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Densified, Finished, Previewed, Saved, Started, Stepped, Stopped
-from scene_experts.training.loop import Job, iterate, measure_step, without_graph
+from scene_experts.training.loop import Job, iterate, without_graph
 from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training
 from support.captures import load
 from support.golden import recorded_text
 from support.lanes import slow_except
 from support.messages import naming
-from support.planes import hole, make_planes, plane
 from support.scenes import METHODS
 from support.synthetic import make_capture
 from support.trainings import assert_same, config, events, last_tensors, start_changed
@@ -51,35 +48,6 @@ def test_resumed_equals_uninterrupted_bit_for_bit_while_rows_come_and_go(recipe,
     second = list(events(cfg, folder, tmp_path / "parts", stop_at=80, resume=True))
     assert second[0].step == 60
     assert_same(last_tensors(tmp_path / "whole"), last_tensors(tmp_path / "parts"))
-
-
-@pytest.mark.skipif(native.load() is None, reason="no compiled library")
-@pytest.mark.parametrize("recipe", slow_except(("scene-experts", "3dgs", "sags"), "scene-experts"))
-def test_a_dense_start_is_told_and_resumed_bit_for_bit(recipe, tmp_path):
-    cfg, folder = config(recipe), make_planes(tmp_path / "planes", plane(4.0))
-    plain = next(events(cfg, folder, stop_at=1))
-    begun, *_, last = events(cfg, folder, tmp_path / "whole", stop_at=8, init="dense")
-    assert "points by a plane sweep over 7 views" in begun.start and plain.start == "" and begun.anchors != plain.anchors
-    list(events(cfg, folder, tmp_path / "parts", stop_at=4, init="dense"))
-    resumed, *_ = events(cfg, folder, tmp_path / "parts", stop_at=8, init="dense", resume=True)
-    assert (resumed.step, resumed.start, type(last)) == (4, "", Finished)
-    assert_same(last_tensors(tmp_path / "whole"), last_tensors(tmp_path / "parts"))
-
-
-@pytest.mark.skipif(native.load() is None, reason="no compiled library")
-def test_a_recipe_starts_densely_with_few_views_and_says_so(tmp_path):
-    cfg, folder = config("scaffold-gs", dense_views=7), make_planes(tmp_path / "planes", plane(4.0))
-    asked, few = (next(events(c, folder, stop_at=1, init=init)) for c, init in ((cfg, "dense"), (cfg, "auto")))
-    told = [re.sub(r"\(.* s CPU\)", "", begun.start) for begun in (asked, few)]
-    assert few.anchors == asked.anchors and told[1] == f"{told[0]}; --init points starts from the capture's own"
-    plain = next(events(cfg, folder, stop_at=1, init="points"))
-    many = next(events(replace(cfg, dense_views=6), folder, stop_at=1, init="auto"))
-    assert plain.start == many.start == "" and plain.anchors == many.anchors
-    flat = make_planes(tmp_path / "grey", hole(3.0, 50.0, 4.0))
-    without = next(events(cfg, flat, stop_at=1, init="auto"))
-    assert "finds no denser ones: it needs photographs that show depth and found it in 0.0 % of their pixels" in without.start
-    with pytest.raises(InputError, match="--init dense"):
-        next(events(cfg, flat, stop_at=1, init="dense"))
 
 
 def test_other_camera_poses_are_refused(folder, tmp_path):
@@ -229,31 +197,6 @@ def test_random_background_and_another_configuration_on_resume(folder, tmp_path)
         list(events(config("scaffold-gs"), folder, tmp_path, stop_at=6, resume=True))
 
 
-def test_the_psnr_of_a_step_is_that_of_the_pixels_that_count(folder):
-    capture = load(folder)
-    training = Training.start(config().scaled(), capture, "cpu")
-    run = Job(RunConfig(config(), Data(folder)))
-    done = iterate(training, run, capture, choose("auto", "cpu"))
-    capture.images.close()
-    half = torch.zeros_like(done.target[..., 0])
-    half[:, : half.shape[1] // 2] = 1
-    columns = half[0] > 0
-    mse = float((done.render.image.detach().clamp(0, 1) - done.target)[:, columns].square().mean())
-    assert measure_step(training, replace(done, mask=half)).psnr == pytest.approx(-10 * math.log10(mse), rel=1e-5)
-    assert measure_step(training, done).psnr != pytest.approx(-10 * math.log10(mse), rel=1e-5)
-
-
-def test_steps_tell_the_balance_of_the_experts(folder):
-    steps = [e for e in events(config(), folder, stop_at=60, log_every=1) if isinstance(e, Stepped)]  # dense to iteration 30
-    for e in steps:
-        assert set(e.balance) == set(e.entropy) == {"opacity", "cov", "color"}
-        assert all(1 - 1e-5 <= v <= 5 for v in e.balance.values()) or e.step > 30
-        assert all(0 <= v <= 1 + 1e-6 for v in e.entropy.values())
-    dense, sparse = steps[29], steps[30]
-    assert sum(dense.balance.values()) == pytest.approx(dense.terms["load"] / 0.01, rel=1e-4)
-    assert sum(sparse.balance.values()) == pytest.approx(sparse.terms["load"] / 0.01 / 2, rel=1e-4)
-
-
 def test_resuming_on_other_views_is_refused(folder, tmp_path):
     list(events(config(), folder, tmp_path, stop_at=3))
     capture = load(folder)
@@ -295,18 +238,6 @@ def test_more_gaussians_than_the_recipes_own_cap_start_and_none_is_added(folder,
     made = replace(made, growth=replace(made.growth, max_anchors=100))
     done = list(events(made, folder, stop_at=3))
     assert isinstance(done[-1], Finished) and "100" in caplog.text
-
-
-def test_the_routing_of_the_whole_scene_is_told_beside_the_views(folder, monkeypatch):
-    def stepped():
-        return [e for e in events(config(), folder, stop_at=20, log_every=10) if isinstance(e, Stepped)]
-
-    for event in stepped():
-        for shares in (event.scene_routing, event.scene_gates, event.routing):
-            assert shares.keys() == {"opacity", "cov", "color"} and all(sum(v) == pytest.approx(1, abs=1e-3) for v in shares.values())
-    monkeypatch.setattr("scene_experts.training.loop.ROUTED", 5)
-    few = stepped()
-    assert few[-1].scene_gates != event.scene_gates and few[-1].psnr == event.psnr  # a smaller sample, the same training
 
 
 @pytest.mark.slow

@@ -1,0 +1,33 @@
+"""Where a training starts: from the points of its capture, or from denser ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from scene_experts.data.capture import Capture
+from scene_experts.data.dense import NoDenseStartError, start_densely
+from scene_experts.data.settings import Data
+from scene_experts.training.config import Train
+from scene_experts.training.state import Training
+
+
+def start(cfg: Train, data: Data, capture: Capture, device: str, dtype: torch.dtype) -> Training:
+    """Start a training from the capture's points, or with --init dense, and with few views where the
+    recipe asks for it, from those of `data.dense`. `cfg` must be scaled. Raises InputError as
+    `loop.train`."""
+    by_recipe = data.init == "auto" and data.points is None and not capture.random_points and len(capture.train) <= cfg.dense_views
+    if data.init != "dense" and not by_recipe:
+        return Training.start(cfg, capture, device, dtype)
+    try:
+        found = start_densely(capture, cfg.growth.max_anchors)
+    except NoDenseStartError as error:
+        if not by_recipe:
+            raise
+        training = Training.start(cfg, capture, device, dtype)
+        training.computed = f"the capture's points; a plane sweep finds no denser ones: it needs {error.expected} and found {error.why}"
+        return training
+    training = Training.start(cfg, replace(capture, points=found.points), device, dtype)
+    training.computed = found.describe() + ("; --init points starts from the capture's own" if by_recipe else "")
+    return training
