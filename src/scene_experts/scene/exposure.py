@@ -14,7 +14,7 @@ plus that between the directions.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -78,6 +78,20 @@ class Exposures(nn.Module):
     def expose(self, image: Tensor, camera: Camera) -> Tensor:
         """Return the picture [H, W, 3] of the scene as a camera photographs it, at most 1."""
         return _Bounded.apply(image * torch.exp2(self.stops_of(camera) / GAMMA).to(image))
+
+    def expose_directly(self, image: Tensor, camera: Camera) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+        """Return `expose` without a graph, and the function that takes the gradient of the loss in
+        it, adds to that of the stops, and returns that in `image`."""
+        with torch.enable_grad():
+            leaf = image.detach().requires_grad_()
+            exposed = self.expose(leaf, camera)
+
+        def go_back(gradient: Tensor) -> Tensor:
+            exposed.backward(gradient)
+            assert leaf.grad is not None
+            return leaf.grad
+
+        return exposed.detach(), go_back
 
     @torch.no_grad()
     def undo(self, photograph: Tensor, camera: Camera) -> Tensor:

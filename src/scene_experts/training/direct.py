@@ -73,8 +73,10 @@ class DirectStep:
         w = self.weights
         decoded, backward_scene = self.prepare(scene, number).draw(camera, number, self.rasterize.visible)
         render, backward_picture = draw_with_gradients(self.rasterize, decoded.gaussians, camera, background)
-        weight = w.weigh_pixels(render.image, target, mask, number)
-        gradients = backward_picture(photometric_gradients(render.image, target, w.dssim, weight))
+        shown, go_back = (render.image, None) if scene.exposures is None else scene.exposures.expose_directly(render.image, camera)
+        gradient = photometric_gradients(shown, target, w.dssim, w.weigh_pixels(shown, target, mask, number))
+        gradients = backward_picture(gradient if go_back is None else go_back(gradient))
+        render = replace(render, image=shown)
         terms = LazyMapping(lambda: compute_terms(Sample(decoded, render, target, mask, number), w))
         if w.regularises:  # these see parameters, which the optimiser is about to move
             dict(terms)

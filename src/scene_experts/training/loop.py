@@ -92,7 +92,7 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
     run.begin(training)
     about = training.scene.describe_decode(training.step + 1)
     direct = direct_of(training, rasterize, training.scene)
-    gradients = "" if direct is None else explain_step(training, run, direct)
+    gradients = "" if direct is None else "through autograd (--shard)" if run.shard else direct.describe(training.scene, training.step + 1)
     yield Started(training.step, total, training.scene.table.total, training.scene.traits, about, training.computed, gradients)
     saved = training.step
     parts: Mapping[str, Tensor] = {}  # terms of the last iteration
@@ -135,12 +135,6 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
         yield Stopped(training.step, run.stop[0])
     else:
         yield Finished(training.step, training.clock.seconds)
-
-
-def explain_step(training: Training, run: Job, direct: DirectStep) -> str:
-    """Say how a view is differentiated on a GPU, for `Started.gradients`."""
-    why = "--shard" if run.shard else "--exposure" if training.scene.exposures is not None else ""
-    return f"through autograd ({why})" if why else direct.describe(training.scene, training.step + 1)
 
 
 def last_iteration(cfg: Train, run: Job) -> int:
@@ -286,7 +280,7 @@ def see_view(
     target, mask = photographs.see(index)
     training.seed_view(number)
     direct = direct_of(training, rasterize, scene)
-    if direct is not None and not direct.refused and scene.exposures is None:
+    if direct is not None and not direct.refused:
         decoded, render, terms = direct.see(scene, camera, number, target, mask, photographs.background(color))
         training.largest.see(decoded, render)
         return Iteration(decoded, render, terms, target, mask)

@@ -64,6 +64,18 @@ def test_gradients_are_those_of_finite_differences(exposures):
     assert torch.autograd.gradcheck(lambda image: made.expose(image, camera), (picture,))
 
 
+def test_without_a_graph_the_gradients_are_the_same(exposures):
+    camera = camera_at(5, 1.0)
+    picture = torch.rand(3, 4, 3, generator=torch.Generator().manual_seed(0))
+    with_graph = picture.clone().requires_grad_()
+    exposures.expose(with_graph, camera).square().sum().backward()
+    stops, exposures.stops.grad = exposures.stops.grad, None
+    with torch.no_grad():
+        exposed, go_back = exposures.expose_directly(picture, camera)
+        gradient = go_back(2 * exposed)
+    assert not exposed.requires_grad and torch.allclose(gradient, with_graph.grad) and torch.allclose(exposures.stops.grad, stops)
+
+
 def test_above_white_only_gradients_that_darken_pass(exposures):
     picture = torch.tensor([[[0.99, 0.99, 0.5]]], requires_grad=True)
     exposures.expose(picture, camera_at(3, 0.0)).backward(torch.tensor([[[1.0, -1.0, -1.0]]]))

@@ -56,6 +56,7 @@ CASES = {
     "distance for one": (varied("scaffold-gs", scene={"add_dist": ("cov",)}), 1, ""),
     "appearance": (varied("scaffold-gs", scene={"appearance": 5}), 1, ""),
     "appearance and places": (varied("scene-experts", scene={"appearance": 5}), 1, ""),
+    "exposures": (replace(varied("scaffold-gs", loss=TERMS), exposure=True), 1, ""),
     "dropped and displaced": (varied("scaffold-gs", scene=MANY), 1, ""),
     "smoothed": (varied("scaffold-gs", scene={"smoothing": 0.2}, loss=TERMS), 1, ""),
     "masked slots": (varied("scaffold-gs", loss=TERMS), 1, ""),
@@ -104,6 +105,7 @@ def see(capture, cfg, step, name, direct):
     else:
         decoded = scene(camera, step, Mode.TRAIN, draw.visible)
         render = draw(decoded.gaussians, camera, background)
+        render = replace(render, image=scene.as_photographed(render.image, camera))
         terms = compute_terms(Sample(decoded, render, target, mask, step), cfg.loss)
         torch.stack(list(terms.values())).sum().backward()
     cfg.growth.observe(scene, decoded, render, max(step, getattr(cfg.growth, "start_stat", 0)) if step == 1 else step)
