@@ -7,9 +7,11 @@ logarithms have the mean 0), so the scene itself is that of the mean exposure: f
 nothing else. After PPISP (Deutsch et al., CVPR 2026), whose vignette and learned response are left
 out here: on fox they changed nothing (results/exposure.md).
 
-A camera that took no training photograph has the gains of those near it: the mean with weights
-1 / d^2, where d is the distance between the positions, over their mean distance from their middle,
-plus that between the directions.
+A camera that took no training photograph has the gains of those near it: the mean of their
+logarithms with weights 1 / d^2, where d is the distance between the positions, over their mean
+distance from their middle, plus that between the directions. That mean times a factor from 0 to 1:
+the one with which the training photographs, each left out in turn, are told best. It is near 1
+where the exposure changes from place to place, and 0 where it changes at random.
 """
 
 from __future__ import annotations
@@ -69,11 +71,23 @@ class Exposures(nn.Module):
         row = self.row.get(camera.id)
         if row is not None:
             return stops[row]
+        weights = self._weigh(camera.position.to(self.positions)[None], _direction(camera).to(self.directions)[None])
+        return self._trust(stops.detach()) * (weights @ stops)[0]
+
+    def _weigh(self, positions: Tensor, directions: Tensor) -> Tensor:
+        """Weights [n, V] of the photographs for cameras; the sum of each row is 1."""
         spread = (self.positions - self.positions.mean(0)).norm(dim=1).mean().clamp_min(1e-12)
-        away = (self.positions - camera.position.to(self.positions)).norm(dim=1) / spread
-        away = away + (self.directions - _direction(camera).to(self.directions)).norm(dim=1)
+        away = torch.cdist(positions, self.positions) / spread + torch.cdist(directions, self.directions)
         weights = away.clamp_min(NEAREST).pow(-2)
-        return weights @ stops / weights.sum()
+        return weights / weights.sum(1, keepdim=True)
+
+    def _trust(self, stops: Tensor) -> float:
+        """How far the photographs near one tell its stops [V, 3]: the factor from 0 to 1."""
+        if len(stops) < 3:
+            return 1.0
+        weights = self._weigh(self.positions, self.directions).fill_diagonal_(0)
+        told = (weights / weights.sum(1, keepdim=True).clamp_min(1e-12)) @ stops
+        return float(((told * stops).sum() / told.square().sum().clamp_min(1e-12)).clamp(0, 1))
 
     def expose(self, image: Tensor, camera: Camera) -> Tensor:
         """Return the picture [H, W, 3] of the scene as a camera photographs it, at most 1."""

@@ -38,13 +38,25 @@ def test_the_mean_of_the_photographs_is_the_scene(exposures):
     assert torch.allclose(stops.mean(0), torch.zeros(3), atol=1e-6)
 
 
-def test_a_camera_without_photograph_has_the_gains_of_those_near_it(exposures):
-    at = lambda x: exposures.stops_of(camera_at(100, x))  # noqa: E731
-    known = exposures.stops.detach() - exposures.stops.detach().mean(0)
-    assert torch.allclose(at(1.0), known[1], atol=1e-3)
-    spread = 2 / 3  # mean distance of the positions from their middle
-    weights = torch.tensor([(0.5 / spread) ** -2, (0.5 / spread) ** -2, (1.5 / spread) ** -2])
-    assert torch.allclose(at(0.5), weights @ known / weights.sum(), atol=1e-5)
+def test_a_camera_without_photograph_has_the_gains_of_those_near_it():
+    made = Exposures([camera_at(i, float(i)) for i in range(12)])
+    with torch.no_grad():
+        made.stops.copy_(torch.linspace(-1, 1, 12)[:, None].expand(12, 3))
+    at = lambda x: made.stops_of(camera_at(100, x))  # noqa: E731
+    weights = torch.tensor([(abs(4.5 - i) / 3) ** -2 for i in range(12)])  # 3: mean distance of the positions from their middle
+    known = made.stops.detach()
+    told = [sum(abs(i - j) ** -2 * float(known[j, 0]) for j in range(12) if j != i) for i in range(12)]
+    told = torch.tensor(told) / torch.tensor([sum(abs(i - j) ** -2 for j in range(12) if j != i) for i in range(12)])
+    trust = min(1.0, float((told * known[:, 0]).sum() / told.square().sum()))
+    assert torch.allclose(at(4.5), trust * (weights @ known / weights.sum()), atol=1e-5)
+    assert float(at(0.0)[0]) < -0.8 and float(at(11.0)[0]) > 0.8 and trust > 0.9
+
+
+def test_gains_at_random_tell_nothing_about_another_camera():
+    made = Exposures([camera_at(i, float(i)) for i in range(40)])
+    with torch.no_grad():
+        made.stops.copy_(torch.where(torch.arange(40) % 2 == 0, 1.0, -1.0)[:, None].expand(40, 3))  # neighbours tell the opposite
+    assert torch.allclose(made.stops_of(camera_at(100, 7.2)), torch.zeros(3), atol=1e-6)
 
 
 def test_gradients_are_those_of_finite_differences(exposures):
