@@ -57,7 +57,7 @@ if not hasattr(se, "make"):
     call("training", *flags, "--data", capture, "--out", run, "--preview-every", "0", *held)
     if scores:
         call("scores", "eval", run)
-    call("page", "export", run, "--format", "html", "--out", page, "--measure", "false")
+    call("page", "export", run, "--format", "html", "--out", page, "--no-measure")
     marks.append(("end", time.monotonic(), cpu()))
     stages = [(a[0], b[1] - a[1], b[2] - a[2]) for a, b in zip(marks, marks[1:])]
     found = Path(run, "results.json")
