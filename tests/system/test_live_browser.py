@@ -222,6 +222,57 @@ def test_the_page_moves_by_hands_keys_links_and_its_list(tmp_path):
         assert not tab.is_visible("#help") and page.errors == []
 
 
+def test_the_first_view_is_that_of_the_screen(tmp_path):
+    """The one of the nearest aspect, cut to the screen; it stays so when a phone is turned."""
+    fov = {"wide": 40.0, "high": 60.0}
+    entries = [
+        {**SEEN[2].pose, "fov": fov["wide"], "width": 16, "height": 9},
+        {**SEEN[3].pose, "fov": fov["high"], "width": 9, "height": 19},
+    ]
+    _, settings = write(tmp_path / "a.html", "scaffold-gs", first=entries)
+    with browsers(GL, 640, 360) as make:
+        page = make().open(tmp_path / "a.html")
+        shown = lambda: page.tab.evaluate("[sceneExperts.page.shown, sceneExperts.page.veil.style.getPropertyValue('--edge')]")  # noqa: E731
+        place = lambda: page.tab.evaluate("sceneExperts.pose().position")  # noqa: E731
+
+        def turn(width, height):
+            page.tab.set_viewport_size({"width": width, "height": height})
+            page.tab.wait_for_function(f"sceneExperts.page.canvas.width === {width}")
+            page.settle()
+
+        page.settle()
+        np.testing.assert_allclose(place(), settings["first"][0]["position"], atol=1e-9)
+        assert shown() == [pytest.approx(40, abs=1e-6), "0.00%"]
+        turn(300, 760)
+        np.testing.assert_allclose(place(), settings["first"][1]["position"], atol=1e-9)
+        assert shown() == [pytest.approx(60, abs=1e-6), "0.00%"]  # a narrower screen shows less of the width
+        turn(800, 360)
+        wide = np.tan(np.radians(shown()[0] / 2)) * 800 / 360
+        assert wide == pytest.approx(np.tan(np.radians(20)) * 16 / 9)  # a wider one less of the height
+
+
+def test_flight_and_jumps_follow_the_clock(tmp_path):
+    """As far in one long frame as in many short ones."""
+    _, settings = write(tmp_path / "a.html", "scaffold-gs", flight=[seen.pose for seen in SEEN])
+    move = """([name, steps, seconds]) => {
+      const page = sceneExperts.page;
+      page.running = true; // frames are made here
+      page.setPose(page.settings.poses[0]);
+      if (name === "flight") page.flight = 0;
+      else if (name === "jump") page.flyTo(page.settings.poses[2]);
+      else page.camera.ask("spin", [0.5, 0.1]);
+      for (let i = 0; i < steps; ++i) page.move(seconds / steps);
+      return page.pose().position;
+    }"""
+    with browsers(GL, WIDTH, HEIGHT) as make:
+        page = make().open(tmp_path / "a.html")
+        page.settle()
+        for name, seconds in (("flight", 5.3), ("jump", 0.7), ("jump", 2.0), ("hands", 0.3)):
+            few, many = (page.tab.evaluate(move, [name, steps, seconds]) for steps in (1, 300))
+            np.testing.assert_allclose(few, many, atol=1e-6 if name != "hands" else 0.02)
+            assert np.abs(np.array(few) - settings["poses"][0]["position"]).max() > 0.01
+
+
 def test_a_damaged_file_is_one_sentence_on_the_page(tmp_path):
     write(tmp_path / "a.html", "scaffold-gs")
     page = (tmp_path / "a.html").read_text()

@@ -308,6 +308,8 @@ def _view_note(work: ExportTask, capture: Capture | None, world: World) -> Note:
     note = work.format.view_note(views, world)
     if views.kind == AROUND:
         note.pop("cameras", None)  # nothing was photographed from there
+    elif work.format.look is not None:
+        note |= work.format.look(run, views, world, work.rasterize)
     return note | ({} if work.options.title is None else {"title": work.options.title})
 
 

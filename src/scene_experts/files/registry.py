@@ -111,6 +111,9 @@ class Format:
     view_note: Callable[[Capture, World], Note] | None = None
     """view_note(capture, world): entries about the capture's cameras that the writer adds to the
     note."""
+    look: Callable[..., Note] | None = None
+    """look(run, capture, world, rasterize): entries that the scene's pictures at the cameras of a
+    capture say, for the note. world: the frame that the contents are written in."""
 
     fit: Callable[..., tuple[Any, list[str]]] | None = None
     """fit(run, contents, world, options, capture, rasterize, tell): contents as precise as the

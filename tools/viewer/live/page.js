@@ -4,6 +4,7 @@ import { openRenderer } from "./renderers.js";
 
 const FLIGHT = 16; // seconds of a round
 const JUMP = 0.9; // seconds from one place to another
+const LONGEST = 0.5; // seconds of flying by keys that one frame carries out
 const REST = 250; // milliseconds without news until the picture is final
 const SLOW = 40, QUICK = 18, LEAST = 0.35; // milliseconds of a frame that lower and raise the resolution; its smallest share
 const WIDEST = 100; // degrees
@@ -22,7 +23,7 @@ export class Page {
     this.veil = find("veil");
     this.veil.style.setProperty("--back", `rgb(${settings.background.map((v) => Math.round(255 * v))})`);
     this.listen();
-    this.setPose(settings.pose);
+    this.setPose(this.first());
     this.readHash();
   }
 
@@ -160,7 +161,14 @@ export class Page {
     this.wake();
   }
 
-  home() { this.index = this.settings.index; this.flyTo(this.settings.pose); }
+  home() { this.index = this.settings.index; this.flyTo(this.first()); }
+
+  // The first view of this screen: that of the nearest aspect, cut to the screen's (`fills`); without any, the best photograph's.
+  first() {
+    const screen = Math.log(innerWidth / innerHeight), away = ({ aspect }) => Math.abs(Math.log(aspect) - screen);
+    const found = [...this.settings.first].sort((a, b) => away(a) - away(b))[0];
+    return found ? { ...found, fills: 1 } : this.settings.pose;
+  }
 
   step(by) {
     const n = this.settings.poses.length;
@@ -180,7 +188,7 @@ export class Page {
     if (isCalm() || !this.renderer) return this.setPose(pose);
     this.flight = null;
     this.held = false;
-    this.jump = { from: { ...this.camera.pose(), fov: this.fov, aspect: this.aspect }, to: { ...pose, fov: pose.fov ?? this.settings.fov }, part: 0 };
+    this.jump = { from: { ...this.camera.pose(), fov: this.fov, aspect: this.aspect, fills: this.fills }, to: { ...pose, fov: pose.fov ?? this.settings.fov, fills: pose.fills ?? 0 }, part: 0 };
     this.wake();
   }
 
@@ -196,14 +204,16 @@ export class Page {
     this.camera.set(pose);
     this.fov = pose.fov ?? this.settings.fov;
     this.aspect = pose.aspect ?? this.aspect ?? this.settings.pose.aspect;
+    this.fills = pose.fills ?? 0;
     this.fit();
   }
 
   pose() { return { ...this.camera.pose(), fov: this.fov }; }
 
-  // The field of view that this screen has: a wide screen is filled by the photograph, a narrow one shows about half more of its width.
+  // The field of view that this screen has: a wide screen is filled by the photograph, a narrow one shows about half more of its width, or
+  // is filled too (`fills` 1).
   fit() {
-    const screen = innerWidth / innerHeight, ratio = this.aspect ? this.aspect / screen : 1, factor = ratio < 1 ? ratio : Math.sqrt(ratio);
+    const screen = innerWidth / innerHeight, ratio = this.aspect ? this.aspect / screen : 1, factor = ratio < 1 ? ratio : ratio ** (0.5 - 0.5 * this.fills);
     const tan = Math.tan((this.fov * Math.PI) / 360);
     this.shown = Math.min(WIDEST, (360 / Math.PI) * Math.atan(factor * tan));
     const share = tan / Math.tan((this.shown * Math.PI) / 360); // of the screen's height that the photograph has
@@ -231,6 +241,7 @@ export class Page {
     this.canvas.width = Math.max(1, Math.round(innerWidth * ratio));
     this.canvas.height = Math.max(1, Math.round(innerHeight * ratio));
     this.canvas.style.cssText = "width:100vw;height:100vh";
+    if (this.fills === 1 && this.held) this.place(this.first()); // the first view of a phone that was turned
     this.fit();
     this.wake();
   }
@@ -240,7 +251,8 @@ export class Page {
     return viewOf(this.camera.pose(), this.shown, width, height, this.settings.nearest);
   }
 
-  // Moves the camera by what keys, hands, a flight or a jump ask for. Returns whether it moved.
+  // Moves the camera by what keys, hands, a flight or a jump ask for in some seconds: where it is depends on the clock, not on the number of
+  // frames. Returns whether it moved.
   move(seconds) {
     const { camera, settings, keys } = this, on = (...names) => (names.some((name) => keys.has(name)) ? 1 : 0);
     if (this.jump) {
@@ -257,7 +269,7 @@ export class Page {
     }
     const fly = [on("KeyD", "ArrowRight") - on("KeyA", "ArrowLeft"), on("KeyQ") - on("KeyE"), on("KeyW", "ArrowUp") - on("KeyS", "ArrowDown")];
     const flies = fly.some(Boolean), moved = camera.step(seconds);
-    if (flies) camera.fly(fly.map((v) => v * settings.speed * seconds));
+    if (flies) camera.fly(fly.map((v) => v * settings.speed * Math.min(seconds, LONGEST)));
     if (moved || flies) this.stay(flies);
     return moved || flies;
   }
@@ -287,7 +299,7 @@ export class Page {
   }
 
   async frame(now) {
-    const { wishes } = this, passed = this.last === null ? 0 : now - this.last, moves = this.move(Math.min(passed / 1000, 0.1));
+    const { wishes } = this, passed = this.last === null ? 0 : now - this.last, moves = this.move(passed / 1000);
     this.last = now;
     if (moves) this.news = performance.now();
     const isResting = performance.now() - this.news >= REST || this.held && !moves;

@@ -2,9 +2,10 @@
 
 The page holds the compact file of a scene of anchors and a script (tools/viewer/live) that decodes
 it for the position of the camera, with WebGPU, or without it with WebGL 2. The note has the entries
-that html's has, and `nearest`, the depth up to which nothing is drawn. What nothing covers shows
-the scene's own background: trainings leave dark things transparent before it, so that another
-colour would be wrong.
+that html's has, `first`, entries of cameras whose views fill screens of their aspects, and
+`nearest`, the depth up to which nothing is drawn. What nothing covers shows the scene's own
+background: trainings leave dark things transparent before it, so that another colour would be
+wrong.
 """
 
 from __future__ import annotations
@@ -20,13 +21,14 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_bytes
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.source import opening
-from scene_experts.data.views import Capture, World
+from scene_experts.data.views import Capture, View, World
 from scene_experts.files.anchors import compact
 from scene_experts.files.anchors.data import AnchorData
 from scene_experts.files.anchors.quality import choose_precision
 from scene_experts.files.anchors.rounding import distance_exponent
+from scene_experts.files.cameras import camera_entries
 from scene_experts.files.formats import html
-from scene_experts.files.measure import Tell
+from scene_experts.files.measure import Painter, Tell
 from scene_experts.files.options import Options
 from scene_experts.files.registry import Format
 from scene_experts.files.result_folder import file_world
@@ -34,13 +36,14 @@ from scene_experts.render import Rasterizer
 from scene_experts.scene.anchors.levels import Levels
 from scene_experts.scene.anchors.mlp import ATTRIBUTES
 from scene_experts.training.run_folder import OpenRun
+from scene_experts.view.filled import find_first_views
 
 BAKED = "baked-html"
 GENERATOR = "scene-experts live"
 MARK = f'<meta name="generator" content="{GENERATOR}">'.encode()
 LICENCE = "scene-experts, Apache-2.0"
 CODE = "live.min.js.gz"
-SPARE = 1000  # bytes for a title, and for numbers that are longer in the frame of the page
+SPARE = 4000  # bytes for a title, first views, and numbers that are longer in the frame of the page
 ROUTERS = {"Linear": "softmax", "Places": "softmax", "Margin": "margin", "Balanced": "balanced"}
 """Routers by the type in a description -> how the script weighs the experts that they choose."""
 LARGEST_HALF = 60_000.0  # beyond it the script holds values in 32 bits
@@ -106,6 +109,7 @@ def page_settings(data: AnchorData, note: Mapping[str, Any]) -> dict[str, Any]:
         "count": len(places) * about["K"],
         "centre": centre.tolist(),
         **view,
+        "first": [html.pose_of(entry, centre) for entry in note.get("first") or []],
         "nearest": float(note.get("nearest") or view["distance"] / 500),
         "background": [float(v) for v in note.get("background", (0.0, 0.0, 0.0))],
         "antialias": about["train"].get("antialias") is True,
@@ -161,6 +165,13 @@ def view_note(capture: Capture, world: World) -> dict[str, Any]:
     return html.view_note(capture, world) | near
 
 
+def look(run: OpenRun, capture: Capture, world: World, rasterize: Rasterizer | None) -> dict[str, Any]:
+    """The entries `first` of a note. See `registry.Format.look` and `view.filled`."""
+    painter, black = Painter.of(run.scene, run.step, rasterize, run.config.train.antialias), torch.zeros(3)
+    found = find_first_views(capture, lambda camera: painter.rasterize(painter.gaussians(camera), camera, black))
+    return {"first": camera_entries([View("first", first.camera, Path()) for first in found], world)}
+
+
 def fit(
     run: OpenRun,
     contents: AnchorData,
@@ -189,6 +200,7 @@ FORMAT = Format(
     marks=(b"<!doctype html>",),
     looks_like=lambda path, head: MARK in head,
     view_note=view_note,
+    look=look,
     fit=fit,
     otherwise=BAKED,
     lacks=find_unknown,

@@ -16,7 +16,8 @@ from scene_experts.core.errors import InputError
 from scene_experts.files.anchors import compact, live
 from scene_experts.files.formats import html
 from scene_experts.files.registry import recognise
-from support.live_scenes import CASES, compare, contents_of, decoded, look, make_run, scene_in_page
+from scene_experts.view.filled import First
+from support.live_scenes import CASES, WORLD, compare, contents_of, decoded, look, make_run, scene_in_page
 from support.messages import naming
 from support.places import ROOT
 from support.splats import splats
@@ -65,6 +66,25 @@ def test_settings_say_how_to_decode(tmp_path):
     }
     assert found["background"] == [0.1, 0.2, 0.3] and found["nearest"] == 0.004
     assert found["exact"] is False and found["levels"] is None and len(found["poses"]) == 1
+
+
+def test_first_views_are_those_that_fill_screens(tmp_path, monkeypatch):
+    """They are chosen by pictures of the scene, and are in the frame of the page."""
+    run, asked = make_run("scaffold-gs"), []
+
+    def find(capture, draw):
+        picture = draw(SEEN.camera)
+        asked.append((capture, picture.alpha.shape, float(picture.alpha.max())))
+        return [First(SEEN.camera, 1.0)]
+
+    monkeypatch.setattr(live, "find_first_views", find)
+    note = live.look(run, "a capture", WORLD, None)
+    assert asked[0][:2] == ("a capture", (240, 320)) and asked[0][2] > 0.1
+    live.write(tmp_path / "a.html", contents_of(run), {"cameras": [SEEN.pose], **note})
+    found = settings_of(tmp_path / "a.html")
+    place = np.array(found["first"][0]["position"]) + found["centre"]
+    np.testing.assert_allclose(place, SEEN.pose["position"], atol=1e-5)
+    assert found["first"][0]["fov"] == pytest.approx(50, abs=1e-3) and found["first"][0]["aspect"] == pytest.approx(4 / 3)
 
 
 def test_values_that_no_half_holds_are_held_in_32_bits(tmp_path):
