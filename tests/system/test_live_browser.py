@@ -11,6 +11,7 @@ import torch
 from scene_experts.core.types import Mode
 from scene_experts.files.anchors import live
 from scene_experts.render import choose
+from scene_experts.view.paint import Look, paint
 from support.live_page import CHROMIUM, GL, GPU, browsers
 from support.live_scenes import CASES, STEP, compare, contents_of, decoded, look, make_run, scene_in_page
 
@@ -70,6 +71,33 @@ def test_pictures_are_those_of_our_rasteriser(tmp_path, flags):
                 assert wanted.std() > 0.05 and psnr(found, wanted) > 45, (case, psnr(found, wanted))
             assert page.errors == [] and all(request.startswith(("file:", "blob:")) for request in page.requests)
             page.tab.close()
+
+
+@pytest.mark.parametrize("flags", [GL, GPU], ids=["WebGL 2", "WebGPU"])
+def test_experts_are_coloured_off_and_alone_without_a_decode(tmp_path, flags):
+    run, settings = write(tmp_path / "a.html", "scene-experts")
+    scene, count = scene_in_page(run, tmp_path / "a.html"), len(settings["experts"])
+    with browsers(flags, WIDTH, HEIGHT) as make:
+        page = make().open(tmp_path / "a.html")
+        go(page, settings["poses"][0])
+        decodes = "sceneExperts.page.renderer.renderer.decodes ?? String(sceneExperts.page.renderer.at)"
+        before, whole = page.tab.evaluate(decodes), page.picture(BACKGROUND)
+        page.tab.click("#parts")
+        click = lambda *names: [page.tab.click(f"#experts button[aria-label='{name}']") for name in names] and page.settle()  # noqa: E731
+        looks = {
+            ("expert 2 alone",): Look(only=(1,)),
+            ("draw all experts", "expert 1 is drawn"): Look(only=tuple(range(1, count))),
+            ("draw all experts", "colour by expert"): Look(show="experts"),
+        }
+        for names, seen in looks.items():
+            click(*names)
+            wanted = paint(scene, SEEN[0].camera, STEP, choose("auto", "cpu"), torch.tensor(BACKGROUND), seen).numpy()
+            assert psnr(wanted, whole) < 40 and psnr(page.picture(BACKGROUND), wanted) > 45, names
+        click("colour by expert")
+        assert psnr(page.picture(BACKGROUND), whole) > 90 and page.tab.evaluate(decodes) == before and page.errors == []
+        page.tab.close()
+        write(tmp_path / "b.html", "scaffold-gs")
+        assert not make().open(tmp_path / "b.html").tab.query_selector("#parts")  # one network
 
 
 @pytest.mark.parametrize("case", [case for case in CASES if case not in ROUTED])

@@ -1,5 +1,6 @@
 // The page: one scene from data inside it alone, decoded and drawn here, and the hands that move through it.
 import { Camera, add, between, length, viewOf } from "./camera.js";
+import { listExperts, listPlaces, show } from "./panels.js";
 import { openRenderer } from "./renderers.js";
 
 const FLIGHT = 16; // seconds of a round
@@ -72,45 +73,12 @@ export class Page {
     on(this.near, "change", () => this.take());
     if (!this.settings.reach) this.near.parentElement.hidden = !(this.near.checked = false);
     const acts = { home: () => this.home(), previous: () => this.step(-1), next: () => this.step(1), whole: () => this.whole(),
-      ask: () => this.show("ask", "help"), close: () => this.show("ask", "help"), flight: () => this.flyAround() };
+      ask: () => show("help"), close: () => show("help"), flight: () => this.flyAround() };
     for (const [name, act] of Object.entries(acts)) on(find(name), "click", act);
+    if (this.settings.experts) listExperts(this.settings.experts, (look) => ((this.look = look), this.wake()));
     find("flight").hidden = this.settings.flight.length < 2;
     if (this.settings.poses.length < 2) return void (find("previous").hidden = find("next").hidden = true);
-    this.listPlaces();
-  }
-
-  // A button and a list: the places of the photographs; a click flies to one.
-  listPlaces() {
-    const make = (name, properties) => Object.assign(document.createElement(name), properties);
-    const button = make("button", { id: "places", textContent: "photographs", title: "places of the photographs" });
-    const list = make("section", { id: "list", hidden: true, tabIndex: 0 });
-    list.setAttribute("aria-label", "places of the photographs");
-    button.setAttribute("aria-expanded", "false");
-    button.setAttribute("aria-controls", "list");
-    list.style.cssText = "position:fixed;left:10px;max-width:min(25rem,calc(100vw - 20px));max-height:40vh;overflow:auto;background:#1c1c1cf2;border-radius:8px;padding:8px";
-    this.settings.poses.forEach((pose, i) => {
-      const place = make("button", { textContent: String(i + 1), title: `fly to photograph ${i + 1}` });
-      place.setAttribute("aria-label", `fly to photograph ${i + 1}`);
-      place.style.margin = "2px";
-      place.addEventListener("click", () => ((this.index = i), this.flyTo(pose)));
-      list.append(place);
-    });
-    button.addEventListener("click", () => this.show("places", "list"));
-    find("next").after(button);
-    find("bar").style.flexWrap = "wrap";
-    find("bar").after(list);
-  }
-
-  // Opens or closes what a button controls; without `open`, the other one of the two.
-  show(button, panel, open) {
-    const isOpen = open ?? find(panel)?.hidden, above = `${find("bar").offsetHeight + 20}px`;
-    for (const [by, what] of [["ask", "help"], ["places", "list"]]) {
-      if (!find(what)) continue;
-      find(what).hidden = !(isOpen && what === panel);
-      find(what).style.bottom = above;
-      find(by).setAttribute("aria-expanded", String(!find(what).hidden));
-      if (what === "list") find(what).style.display = find(what).hidden ? "none" : "block";
-    }
+    listPlaces(this.settings.poses, (i) => ((this.index = i), this.flyTo(this.settings.poses[i])));
   }
 
   // Somebody takes the camera.
@@ -155,7 +123,7 @@ export class Page {
   press(event) {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     const act = { KeyR: () => this.home(), KeyF: () => this.whole(), BracketLeft: () => this.step(-1), BracketRight: () => this.step(1),
-      KeyL: () => this.writeHash(), KeyH: () => this.show("ask", "help"), Escape: () => this.show("ask", "help", false), KeyP: () => this.flyAround() }[event.code];
+      KeyL: () => this.writeHash(), KeyH: () => show("help"), Escape: () => show("help", false), KeyP: () => this.flyAround() }[event.code];
     if (act) act();
     else if (/^(Key[WASDQE]|Arrow)/.test(event.code) && !/^(INPUT|SECTION)$/.test(event.target.tagName)) (this.keys.add(event.code), this.take());
     this.wake();
@@ -248,7 +216,7 @@ export class Page {
 
   view(scale = 1) {
     const width = Math.max(1, Math.round(this.canvas.width * scale)), height = Math.max(1, Math.round(this.canvas.height * scale));
-    return viewOf(this.camera.pose(), this.shown, width, height, this.settings.nearest);
+    return { ...viewOf(this.camera.pose(), this.shown, width, height, this.settings.nearest), look: this.look };
   }
 
   // Moves the camera by what keys, hands, a flight or a jump ask for in some seconds: where it is depends on the clock, not on the number of

@@ -37,6 +37,7 @@ from scene_experts.scene.anchors.levels import Levels
 from scene_experts.scene.anchors.mlp import ATTRIBUTES
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.view.filled import find_first_views
+from scene_experts.view.paint import PALETTE
 
 BAKED = "baked-html"
 GENERATOR = "scene-experts live"
@@ -114,6 +115,7 @@ def page_settings(data: AnchorData, note: Mapping[str, Any]) -> dict[str, Any]:
         "background": [float(v) for v in note.get("background", (0.0, 0.0, 0.0))],
         "antialias": about["train"].get("antialias") is True,
         "heads": {a: _head(a, data) for a in ATTRIBUTES},
+        "experts": _palette(data),
         "router": _positions(about, centre),
         "levels": _levels(about),
         "smoothing": float(config.get("smoothing", 0.0)) if "interval" in data.columns else 0.0,
@@ -134,6 +136,16 @@ def _head(attribute: str, data: AnchorData) -> dict[str, Any]:
         "position": f"{attribute}.router.weight" in networks and networks[f"{attribute}.router.weight"].shape[1] > about["F"],
         "distance": 2.0**exponent,
     }
+
+
+def _palette(data: AnchorData) -> list[tuple[float, float, float]] | None:
+    """The colours of the experts that anchors have; None for one network, and for more than there are
+    colours."""
+    for attribute in reversed(ATTRIBUTES):
+        if _head(attribute, data)["alone"] is None:
+            count = len(data.networks[f"{attribute}.experts.w1"])
+            return list(PALETTE[:count]) if count <= len(PALETTE) else None
+    return None
 
 
 def _positions(about: dict[str, Any], centre: Tensor) -> dict[str, Any]:

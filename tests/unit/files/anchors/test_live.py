@@ -17,6 +17,7 @@ from scene_experts.files.anchors import compact, live
 from scene_experts.files.formats import html
 from scene_experts.files.registry import recognise
 from scene_experts.view.filled import First
+from scene_experts.view.paint import PALETTE
 from support.live_scenes import CASES, WORLD, compare, contents_of, decoded, look, make_run, scene_in_page
 from support.messages import naming
 from support.places import ROOT
@@ -66,6 +67,13 @@ def test_settings_say_how_to_decode(tmp_path):
     }
     assert found["background"] == [0.1, 0.2, 0.3] and found["nearest"] == 0.004
     assert found["exact"] is False and found["levels"] is None and len(found["poses"]) == 1
+
+
+def test_settings_have_a_colour_for_each_of_several_experts(tmp_path):
+    for case, count in (("scene-experts", 5), ("moe-gs-e3-dense", 3), ("scaffold-gs", None)):
+        write(tmp_path / "a.html", case)
+        found = settings_of(tmp_path / "a.html")["experts"]
+        assert found is None if count is None else [tuple(color) for color in found] == list(PALETTE[:count])
 
 
 def test_first_views_are_those_that_fill_screens(tmp_path, monkeypatch):
