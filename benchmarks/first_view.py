@@ -29,6 +29,7 @@ from scene_experts.core.types import Camera
 from scene_experts.data.views import World
 from scene_experts.files.anchors import live
 from scene_experts.files.measure import Painter, capture_if_there
+from scene_experts.files.options import DEFAULT
 from scene_experts.files.scene_folder import world_of
 from scene_experts.geometry.poses import make_pose, with_fov
 from scene_experts.training.run_folder import open_run
@@ -79,7 +80,7 @@ def main() -> None:
 
         evidence = Evidence.of(capture, draw, most=len(capture.views), side=SIDE)
         model, note = capture.views[0].camera, live.view_note(capture, world)
-        first = first_entries(args.page) if args.page else live.look(run, capture, world, None)["first"]
+        first = first_entries(args.page) if args.page else live.look(run, capture, world, DEFAULT, None)["first"]
 
         def shares(camera: Camera) -> dict[str, float]:
             """The shares of a picture's areas that are filled, and of its pixels that are opaque, seen and filled."""

@@ -1,12 +1,14 @@
 """The live page in headless Chromium, with WebGPU in software and with WebGL 2 alone: its decode is Python's, its pictures are our
 rasteriser's, and it asks for nothing. Pictures are read from the page's own texture: the canvas of a software device shows none."""
 
+import io
 import json
 import re
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from scene_experts.core.types import Mode
 from scene_experts.files.anchors import live
@@ -277,6 +279,28 @@ def test_the_first_view_is_that_of_the_screen(tmp_path):
         turn(800, 360)
         wide = np.tan(np.radians(shown()[0] / 2)) * 800 / 360
         assert wide == pytest.approx(np.tan(np.radians(20)) * 16 / 9)  # a wider one less of the height
+
+
+def test_a_photograph_fades_in_at_its_place_and_goes_when_the_camera_moves(tmp_path):
+    stream = io.BytesIO()
+    Image.new("RGB", (32, 24), (200, 30, 30)).save(stream, "WEBP")
+    write(tmp_path / "a.html", "scaffold-gs", pictures=[b"", stream.getvalue(), b"", b""])
+    with browsers(GL, WIDTH, HEIGHT) as make:
+        page = make().open(tmp_path / "a.html")
+        image, shown = page.tab.locator("main > img"), "document.querySelector('main > img').style.opacity"
+        page.settle()
+        assert page.tab.evaluate(shown) == "0"
+        page.tab.click("#places")
+        page.tab.click("#list button:nth-child(2)")
+        page.tab.wait_for_function(f"{shown} === '1'")
+        box = image.bounding_box()
+        np.testing.assert_allclose([box["x"], box["y"], box["width"], box["height"]], [0, 0, WIDTH, HEIGHT], atol=0.5)
+        page.tab.mouse.move(160, 60)
+        page.tab.mouse.down()
+        page.tab.mouse.move(190, 60)
+        page.tab.mouse.up()
+        assert page.tab.evaluate(shown) == "0" and page.errors == []
+        assert all(request.startswith(("file:", "blob:", "data:")) for request in page.requests)
 
 
 def test_flight_and_jumps_follow_the_clock(tmp_path):

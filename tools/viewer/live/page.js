@@ -1,6 +1,6 @@
 // The page: one scene from data inside it alone, decoded and drawn here, and the hands that move through it.
 import { Camera, add, between, length, viewOf } from "./camera.js";
-import { listExperts, listPlaces, show } from "./panels.js";
+import { listExperts, listPlaces, makePhotograph, show } from "./panels.js";
 import { openRenderer } from "./renderers.js";
 
 const FLIGHT = 16; // seconds of a round
@@ -77,6 +77,7 @@ export class Page {
     for (const [name, act] of Object.entries(acts)) on(find(name), "click", act);
     if (this.settings.experts) listExperts(this.settings.experts, (look) => ((this.look = look), this.wake()));
     find("flight").hidden = this.settings.flight.length < 2;
+    if (this.settings.poses.some((pose) => pose.picture)) this.photograph = makePhotograph(this);
     if (this.settings.poses.length < 2) return void (find("previous").hidden = find("next").hidden = true);
     listPlaces(this.settings.poses, (i) => ((this.index = i), this.flyTo(this.settings.poses[i])));
   }
@@ -85,6 +86,7 @@ export class Page {
   take() {
     this.held = false;
     this.flight = this.jump = null;
+    this.photograph?.();
     this.wake();
   }
 
@@ -149,10 +151,12 @@ export class Page {
   flyAround() {
     this.flight = this.flight === null && this.settings.flight.length > 1 ? 0 : null;
     this.jump = null;
+    this.photograph?.();
     this.wake();
   }
 
   flyTo(pose) {
+    this.photograph?.();
     if (isCalm() || !this.renderer) return this.setPose(pose);
     this.flight = null;
     this.held = false;
@@ -165,6 +169,7 @@ export class Page {
     this.flight = this.jump = null;
     this.place(pose);
     this.held = true;
+    this.photograph?.(pose.picture);
     this.wake();
   }
 

@@ -37,12 +37,35 @@ function addPanel(after, id, text, title, panel, label) {
 // The places of the photographs; a click flies to one: go(i).
 export function listPlaces(poses, go) {
   const list = addPanel("next", "places", "photographs", "places of the photographs", "list", "places of the photographs");
-  poses.forEach((_, i) => {
+  poses.forEach((pose, i) => {
     const place = make("button", { textContent: String(i + 1), title: `fly to photograph ${i + 1}` }, `fly to photograph ${i + 1}`);
     place.style.margin = "2px";
+    if (pose.picture) place.replaceChildren(make("img", { src: pose.picture, alt: "", width: 72, style: "display:block;border-radius:3px" }));
     place.addEventListener("click", () => go(i));
     list.append(place);
   });
+}
+
+const SHOWN = 3500; // milliseconds that a photograph stays
+
+// A function that fades a photograph of the present pose in and out again: photograph(picture); without a picture, it goes.
+export function makePhotograph(page) {
+  const image = make("img", { alt: "the photograph", hidden: true });
+  image.style.cssText = "position:fixed;pointer-events:none;opacity:0;transition:opacity .7s;left:50%;top:50%;transform:translate(-50%,-50%)";
+  find("veil").after(image);
+  let later = 0;
+  const leave = () => (image.style.opacity = 0);
+  return (picture) => {
+    clearTimeout(later);
+    if (!picture) return void leave();
+    const share = Math.tan((page.fov * Math.PI) / 360) / Math.tan((page.shown * Math.PI) / 360); // of the screen's height
+    image.hidden = false;
+    image.src = picture;
+    image.style.height = `${100 * share}vh`;
+    image.style.width = `${100 * share * page.aspect}vh`;
+    image.decode().then(() => (image.style.opacity = 1), leave);
+    later = setTimeout(leave, SHOWN);
+  };
 }
 
 // The experts of a scene that has several: coloured, each on or off, one alone. palette: RGB in [0, 1] of each; draw(look) draws a look:

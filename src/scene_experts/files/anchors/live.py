@@ -2,15 +2,18 @@
 
 The page holds the compact file of a scene of anchors and a script (tools/viewer/live) that decodes
 it for the position of the camera, with WebGPU, or without it with WebGL 2. The note has the entries
-that html's has, `first`, entries of cameras whose views fill screens of their aspects, and
-`nearest`, the depth up to which nothing is drawn. What nothing covers shows the scene's own
+that html's has, `first`, entries of cameras whose views fill screens of their aspects, `pictures`,
+small photographs of the entries in `cameras` as WebP files, and `nearest`, the depth up to which
+nothing is drawn. What nothing covers shows the scene's own
 background: trainings leave dark things transparent before it, so that another colour would be
 wrong.
 """
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +29,7 @@ from scene_experts.files.anchors import compact
 from scene_experts.files.anchors.data import AnchorData
 from scene_experts.files.anchors.quality import choose_precision
 from scene_experts.files.anchors.rounding import distance_exponent
+from scene_experts.files.anchors.thumbnails import BYTES, make_thumbnails
 from scene_experts.files.cameras import camera_entries
 from scene_experts.files.formats import html
 from scene_experts.files.measure import Painter, Tell
@@ -57,9 +61,10 @@ def write(path: Path, data: AnchorData, note: dict[str, Any]) -> str:
     cannot draw, and as `compact.write`."""
     expect_drawable(data)
     encoded, sizes = compact.encode(data)
-    page = make_page(data, note, encoded)
+    page, pictures = make_page(data, note, encoded), sum(4 * ((len(picture) + 2) // 3) for picture in note.get("pictures", ()))
     write_bytes(Path(path), page)
-    return f"{len(page) - 4 * ((len(encoded) + 2) // 3):,} bytes of page and script, {sizes}"
+    photographs = f"{pictures:,} bytes of photographs, " if pictures else ""
+    return f"{len(page) - 4 * ((len(encoded) + 2) // 3) - pictures:,} bytes of page and script, {photographs}{sizes}"
 
 
 def make_page(data: AnchorData, note: Mapping[str, Any], encoded: bytes) -> bytes:
@@ -110,6 +115,7 @@ def page_settings(data: AnchorData, note: Mapping[str, Any]) -> dict[str, Any]:
         "count": len(places) * about["K"],
         "centre": centre.tolist(),
         **view,
+        "poses": [pose | _picture(picture) for pose, picture in zip_longest(view["poses"], note.get("pictures", ()), fillvalue=b"")],
         "first": [html.pose_of(entry, centre) for entry in note.get("first") or []],
         "nearest": float(note.get("nearest") or view["distance"] / 500),
         "background": [float(v) for v in note.get("background", (0.0, 0.0, 0.0))],
@@ -121,6 +127,11 @@ def page_settings(data: AnchorData, note: Mapping[str, Any]) -> dict[str, Any]:
         "smoothing": float(config.get("smoothing", 0.0)) if "interval" in data.columns else 0.0,
         "exact": not _fits_halves(data),
     }
+
+
+def _picture(picture: bytes) -> dict[str, str]:
+    """The entry of a pose whose photograph is in the page."""
+    return {"picture": f"data:image/webp;base64,{base64.b64encode(picture).decode()}"} if picture else {}
 
 
 def _head(attribute: str, data: AnchorData) -> dict[str, Any]:
@@ -177,11 +188,13 @@ def view_note(capture: Capture, world: World) -> dict[str, Any]:
     return html.view_note(capture, world) | near
 
 
-def look(run: OpenRun, capture: Capture, world: World, rasterize: Rasterizer | None) -> dict[str, Any]:
-    """The entries `first` of a note. See `registry.Format.look` and `view.filled`."""
+def look(run: OpenRun, capture: Capture, world: World, options: Options, rasterize: Rasterizer | None) -> dict[str, Any]:
+    """The entries `first` and `pictures` of a note. See `registry.Format.look`, `view.filled` and
+    `thumbnails`."""
+    pictures = {"pictures": make_thumbnails(capture)} if options.photographs else {}
     painter, black = Painter.of(run.scene, run.step, rasterize, run.config.train.antialias), torch.zeros(3)
     found = find_first_views(capture, lambda camera: painter.rasterize(painter.gaussians(camera), camera, black))
-    return {"first": camera_entries([View("first", first.camera, Path()) for first in found], world)}
+    return {"first": camera_entries([View("first", view.camera, Path()) for view in found], world), **pictures}
 
 
 def fit(
@@ -197,9 +210,10 @@ def fit(
     expect_drawable(contents)
 
     note = {} if capture is None or options.target_mb == 0 else view_note(capture, world)
+    spare = SPARE + (BYTES * 4 // 3 if options.photographs else 0)
 
     def size(data: AnchorData) -> int:
-        return SPARE + len(make_page(data, note, compact.encode(data)[0]))
+        return spare + len(make_page(data, note, compact.encode(data)[0]))
 
     return choose_precision(run, contents, world, options, capture, rasterize, tell, size)
 

@@ -15,6 +15,7 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.files.anchors import compact, live
 from scene_experts.files.formats import html
+from scene_experts.files.options import DEFAULT
 from scene_experts.files.registry import recognise
 from scene_experts.view.filled import First
 from scene_experts.view.paint import PALETTE
@@ -86,13 +87,21 @@ def test_first_views_are_those_that_fill_screens(tmp_path, monkeypatch):
         return [First(SEEN.camera, 1.0)]
 
     monkeypatch.setattr(live, "find_first_views", find)
-    note = live.look(run, "a capture", WORLD, None)
+    note = live.look(run, "a capture", WORLD, DEFAULT, None)
     assert asked[0][:2] == ("a capture", (240, 320)) and asked[0][2] > 0.1
     live.write(tmp_path / "a.html", contents_of(run), {"cameras": [SEEN.pose], **note})
     found = settings_of(tmp_path / "a.html")
     place = np.array(found["first"][0]["position"]) + found["centre"]
     np.testing.assert_allclose(place, SEEN.pose["position"], atol=1e-5)
     assert found["first"][0]["fov"] == pytest.approx(50, abs=1e-3) and found["first"][0]["aspect"] == pytest.approx(4 / 3)
+
+
+def test_photographs_are_in_the_poses_and_in_the_size(tmp_path):
+    run = make_run("scaffold-gs")
+    plain = live.write(tmp_path / "a.html", contents_of(run), {"cameras": [SEEN.pose, SEEN.pose]})
+    told = live.write(tmp_path / "b.html", contents_of(run), {"cameras": [SEEN.pose, SEEN.pose], "pictures": [b"", b"RIFF...."]})
+    assert [pose.get("picture") for pose in settings_of(tmp_path / "b.html")["poses"]] == [None, "data:image/webp;base64,UklGRi4uLi4="]
+    assert "photographs" not in plain and ", 12 bytes of photographs, " in told
 
 
 def test_values_that_no_half_holds_are_held_in_32_bits(tmp_path):
