@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -111,11 +110,12 @@ def page_settings(data: AnchorData, note: Mapping[str, Any]) -> dict[str, Any]:
     view = html.view_settings(places - centre, note, centre)
     for name in ("near", "far"):
         del view[name]
+    pictures = note.get("pictures") or [b""] * len(view["poses"])
     return {
         "count": len(places) * about["K"],
         "centre": centre.tolist(),
         **view,
-        "poses": [pose | _picture(picture) for pose, picture in zip_longest(view["poses"], note.get("pictures", ()), fillvalue=b"")],
+        "poses": [pose | _picture(picture) for pose, picture in zip(view["poses"], pictures)],
         "first": [html.pose_of(entry, centre) for entry in note.get("first") or []],
         "nearest": float(note.get("nearest") or view["distance"] / 500),
         "background": [float(v) for v in note.get("background", (0.0, 0.0, 0.0))],
