@@ -90,7 +90,7 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class _Place:
+class _Standpoint:
     """A photograph's place with what is covered around its picture."""
 
     camera: Camera  # of the photograph, small, perhaps turned
@@ -130,7 +130,7 @@ class _Place:
 class _View:
     """A view from a place."""
 
-    place: _Place
+    place: _Standpoint
     up: float  # tangent of half its height
     size: float  # half the height or width that it shows, the smaller one, where all photographs look
     share: float  # that is covered
@@ -166,7 +166,7 @@ def find_first_views(capture: Capture, draw: Draw, aspects: Sequence[float] = AS
         aimed = replace(camera, world_to_cam=look_at(camera.position.double(), rig.centre, rig.up).float())
         for turned in (camera, aimed):
             wide = _widened(turned)
-            places.append(_Place(turned, wide, evidence.covered(wide, draw(wide)), away))
+            places.append(_Standpoint(turned, wide, evidence.covered(wide, draw(wide)), away))
     best = [max((place.widest(aspect) for place in places), key=lambda view: view.rank) for aspect in aspects]
     return [First(view.camera(aspect), view.share) for view, aspect in zip(best, aspects) if view.share >= MOSTLY]
 
