@@ -1,16 +1,19 @@
 """The live page in headless Chromium, with WebGPU in software and with WebGL 2 alone: its decode is Python's, its pictures are our
 rasteriser's, and it asks for nothing. Pictures are read from the page's own texture: the canvas of a software device shows none."""
 
+import io
 import json
 import re
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from scene_experts.core.types import Mode
 from scene_experts.files.anchors import live
 from scene_experts.render import choose
+from scene_experts.view.paint import Look, paint
 from support.live_page import CHROMIUM, GL, GPU, browsers
 from support.live_scenes import CASES, STEP, compare, contents_of, decoded, look, make_run, scene_in_page
 
@@ -70,6 +73,33 @@ def test_pictures_are_those_of_our_rasteriser(tmp_path, flags):
                 assert wanted.std() > 0.05 and psnr(found, wanted) > 45, (case, psnr(found, wanted))
             assert page.errors == [] and all(request.startswith(("file:", "blob:")) for request in page.requests)
             page.tab.close()
+
+
+@pytest.mark.parametrize("flags", [GL, GPU], ids=["WebGL 2", "WebGPU"])
+def test_experts_are_coloured_off_and_alone_without_a_decode(tmp_path, flags):
+    run, settings = write(tmp_path / "a.html", "scene-experts")
+    scene, count = scene_in_page(run, tmp_path / "a.html"), len(settings["experts"])
+    with browsers(flags, WIDTH, HEIGHT) as make:
+        page = make().open(tmp_path / "a.html")
+        go(page, settings["poses"][0])
+        decodes = "sceneExperts.page.renderer.renderer.decodes ?? String(sceneExperts.page.renderer.at)"
+        before, whole = page.tab.evaluate(decodes), page.picture(BACKGROUND)
+        page.tab.click("#parts")
+        click = lambda *names: [page.tab.click(f"#experts button[aria-label='{name}']") for name in names] and page.settle()  # noqa: E731
+        looks = {
+            ("expert 2 alone",): Look(only=(1,)),
+            ("draw all experts", "expert 1 is drawn"): Look(only=tuple(range(1, count))),
+            ("draw all experts", "colour by expert"): Look(show="experts"),
+        }
+        for names, seen in looks.items():
+            click(*names)
+            wanted = paint(scene, SEEN[0].camera, STEP, choose("auto", "cpu"), torch.tensor(BACKGROUND), seen).numpy()
+            assert psnr(wanted, whole) < 40 and psnr(page.picture(BACKGROUND), wanted) > 45, names
+        click("colour by expert")
+        assert psnr(page.picture(BACKGROUND), whole) > 90 and page.tab.evaluate(decodes) == before and page.errors == []
+        page.tab.close()
+        write(tmp_path / "b.html", "scaffold-gs")
+        assert not make().open(tmp_path / "b.html").tab.query_selector("#parts")  # one network
 
 
 @pytest.mark.parametrize("case", [case for case in CASES if case not in ROUTED])
@@ -220,6 +250,79 @@ def test_the_page_moves_by_hands_keys_links_and_its_list(tmp_path):
         assert tab.is_visible("#help") and not tab.is_visible("#list")
         tab.keyboard.press("Escape")
         assert not tab.is_visible("#help") and page.errors == []
+
+
+def test_the_first_view_is_that_of_the_screen(tmp_path):
+    """The one of the nearest aspect, cut to the screen; it stays so when a phone is turned."""
+    fov = {"wide": 40.0, "high": 60.0}
+    entries = [
+        {**SEEN[2].pose, "fov": fov["wide"], "width": 16, "height": 9},
+        {**SEEN[3].pose, "fov": fov["high"], "width": 9, "height": 19},
+    ]
+    _, settings = write(tmp_path / "a.html", "scaffold-gs", first=entries)
+    with browsers(GL, 640, 360) as make:
+        page = make().open(tmp_path / "a.html")
+        shown = lambda: page.tab.evaluate("[sceneExperts.page.shown, sceneExperts.page.veil.style.getPropertyValue('--edge')]")  # noqa: E731
+        place = lambda: page.tab.evaluate("sceneExperts.pose().position")  # noqa: E731
+
+        def turn(width, height):
+            page.tab.set_viewport_size({"width": width, "height": height})
+            page.tab.wait_for_function(f"sceneExperts.page.canvas.width === {width}")
+            page.settle()
+
+        page.settle()
+        np.testing.assert_allclose(place(), settings["first"][0]["position"], atol=1e-9)
+        assert shown() == [pytest.approx(40, abs=1e-6), "0.00%"]
+        turn(300, 760)
+        np.testing.assert_allclose(place(), settings["first"][1]["position"], atol=1e-9)
+        assert shown() == [pytest.approx(60, abs=1e-6), "0.00%"]  # a narrower screen shows less of the width
+        turn(800, 360)
+        wide = np.tan(np.radians(shown()[0] / 2)) * 800 / 360
+        assert wide == pytest.approx(np.tan(np.radians(20)) * 16 / 9)  # a wider one less of the height
+
+
+def test_a_photograph_fades_in_at_its_place_and_goes_when_the_camera_moves(tmp_path):
+    stream = io.BytesIO()
+    Image.new("RGB", (32, 24), (200, 30, 30)).save(stream, "WEBP")
+    write(tmp_path / "a.html", "scaffold-gs", pictures=[b"", stream.getvalue(), b"", b""])
+    with browsers(GL, WIDTH, HEIGHT) as make:
+        page = make().open(tmp_path / "a.html")
+        image, shown = page.tab.locator("main > img"), "document.querySelector('main > img').style.opacity"
+        page.settle()
+        assert page.tab.evaluate(shown) == "0"
+        page.tab.click("#places")
+        page.tab.click("#list button:nth-child(2)")
+        page.tab.wait_for_function(f"{shown} === '1'")
+        box = image.bounding_box()
+        np.testing.assert_allclose([box["x"], box["y"], box["width"], box["height"]], [0, 0, WIDTH, HEIGHT], atol=0.5)
+        page.tab.mouse.move(160, 60)
+        page.tab.mouse.down()
+        page.tab.mouse.move(190, 60)
+        page.tab.mouse.up()
+        assert page.tab.evaluate(shown) == "0" and page.errors == []
+        assert all(request.startswith(("file:", "blob:", "data:")) for request in page.requests)
+
+
+def test_flight_and_jumps_follow_the_clock(tmp_path):
+    """As far in one long frame as in many short ones."""
+    _, settings = write(tmp_path / "a.html", "scaffold-gs", flight=[seen.pose for seen in SEEN])
+    move = """([name, steps, seconds]) => {
+      const page = sceneExperts.page;
+      page.running = true; // frames are made here
+      page.setPose(page.settings.poses[0]);
+      if (name === "flight") page.flight = 0;
+      else if (name === "jump") page.flyTo(page.settings.poses[2]);
+      else page.camera.ask("spin", [0.5, 0.1]);
+      for (let i = 0; i < steps; ++i) page.move(seconds / steps);
+      return page.pose().position;
+    }"""
+    with browsers(GL, WIDTH, HEIGHT) as make:
+        page = make().open(tmp_path / "a.html")
+        page.settle()
+        for name, seconds in (("flight", 5.3), ("jump", 0.7), ("jump", 2.0), ("hands", 0.3)):
+            few, many = (page.tab.evaluate(move, [name, steps, seconds]) for steps in (1, 300))
+            np.testing.assert_allclose(few, many, atol=1e-6 if name != "hands" else 0.02)
+            assert np.abs(np.array(few) - settings["poses"][0]["position"]).max() > 0.01
 
 
 def test_a_damaged_file_is_one_sentence_on_the_page(tmp_path):

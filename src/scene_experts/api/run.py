@@ -270,6 +270,7 @@ class Run:
         floaters: Literal["keep", "remove"] = "keep",
         title: str | None = None,
         cells: int = 256,
+        photographs: bool = False,
     ) -> Path:
         """Write the scene to a file that other tools or later runs read.
 
@@ -300,6 +301,7 @@ class Run:
                 supports.
             title: html: title of the page. Default: the name of the capture.
             cells: mesh: voxels along its longest side, 8 to 2048.
+            photographs: html of a scene with networks: put small photographs into the page.
 
         Returns:
             The path of the file or folder.
@@ -309,7 +311,9 @@ class Run:
                 unknown or out of range.
             RunError: The disk is full.
         """
-        options = Options(False, quality, target_mb, sh_degree, max_gaussians, prune, refine, frame, crop, floaters, title, cells)
+        options = Options(
+            False, quality, target_mb, sh_degree, max_gaussians, prune, refine, frame, crop, floaters, title, cells, photographs=photographs
+        )
         expect_words(options)
         folder, opened = self._in_folder("export"), self._opened
         if self._device != "cpu":

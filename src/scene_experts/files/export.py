@@ -89,6 +89,8 @@ def export_several(
         out.mkdir(parents=True, exist_ok=True)
     works = [ExportTask(run, name, format_named(name), options, rasterize, tell, command) for name in dict.fromkeys(formats)]
     _expect_fitted(works, options)
+    if options.photographs and not any(work.format.look for work in works):
+        raise InputError(f"expected --photographs with --format html of a scene with networks, found {works[0].name}; leave it out")
     standard, places = [], []
     for work in works:
         if work.format.family == GAUSSIANS:
@@ -100,7 +102,8 @@ def export_several(
             if work.format.needs is not None:
                 work.format.needs()
     # the other options are those of the standard files then
-    own = Options(measure=options.measure, quality=options.quality, target_mb=options.target_mb) if standard else options
+    kept = {name: getattr(options, name) for name in ("measure", "photographs", *FITTED)}
+    own = Options(**kept) if standard else options
     written = [_export_drawn(work, out) for work in works if work.format.draw is not None]
     rest = [work for work in works if work.format.draw is None and work.format.family != GAUSSIANS]
     written += [_export_scene(replace(work, options=own), out) for work in rest]
@@ -234,6 +237,8 @@ def _expect_unused(options: Options, format: str) -> None:
     for f in fields(options):
         if f.name == "measure" or getattr(options, f.name) == f.default or (f.name == "title" and format_named(format).view_note):
             continue
+        if f.name == "photographs" and format_named(format).look is not None:
+            continue
         if f.name in FITTED:
             if format_named(format).fit is None:
                 raise InputError(f"expected {_flag(f.name)} with --format compact or html, found --format {format}; leave it out")
@@ -308,6 +313,8 @@ def _view_note(work: ExportTask, capture: Capture | None, world: World) -> Note:
     note = work.format.view_note(views, world)
     if views.kind == AROUND:
         note.pop("cameras", None)  # nothing was photographed from there
+    if work.format.look is not None and (views.kind != AROUND or work.options.photographs):
+        note |= work.format.look(run, views, world, work.options, work.rasterize)
     return note | ({} if work.options.title is None else {"title": work.options.title})
 
 

@@ -14,8 +14,8 @@ MAX_DEGREE = 3  # of spherical harmonics in any format
 
 @dataclass(frozen=True)
 class Options:
-    """What to write, and whether to measure it. All but `measure`, `quality` and `target_mb` are for
-    formats of standard Gaussians."""
+    """What to write, and whether to measure it. All but `measure`, `quality`, `target_mb` and
+    `photographs` are for formats of standard Gaussians."""
 
     measure: bool = True
     """Draw the held-out views from the run and from the file, and say what the file costs in
@@ -52,6 +52,9 @@ class Options:
     """mesh: voxels along its longest side."""
     levels: bool = False
     """Standard files: one file per level of detail, each without the finer levels."""
+    photographs: bool = False
+    """html of a scene with networks: put small photographs into the page, which fade in at their
+    places; about 0.1 MB more."""
 
 
 DEFAULT = Options()

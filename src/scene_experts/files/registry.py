@@ -111,6 +111,11 @@ class Format:
     view_note: Callable[[Capture, World], Note] | None = None
     """view_note(capture, world): entries about the capture's cameras that the writer adds to the
     note."""
+    look: Callable[..., Note] | None = None
+    """look(run, capture, world, options, rasterize): entries for the note that take the scene's
+    pictures at the cameras of a capture, or its photographs (`photographs`). world: the frame that
+    the contents are written in. Raises InputError for photographs that are gone. None: that option
+    is refused."""
 
     fit: Callable[..., tuple[Any, list[str]]] | None = None
     """fit(run, contents, world, options, capture, rasterize, tell): contents as precise as the

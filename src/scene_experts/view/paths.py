@@ -75,12 +75,18 @@ def analyse_cameras(capture: Capture) -> CameraRig:
 
 
 def choose_best_view(capture: Capture) -> int:
-    """Return the index of the view that shows a capture best at first sight, among the training
-    views: those are drawn best.
+    """Return the index of the view that shows a capture best at first sight: the first of
+    `rank_views`."""
+    return rank_views(capture)[0]
 
-    The view is upright (or the one nearest to upright) and not nearer to the centre than half of
-    the training cameras (or the farthest). Among those, the view is chosen that looks most level
-    and most directly at the centre.
+
+def rank_views(capture: Capture) -> list[int]:
+    """Return the indices of the views that show a capture well at first sight, best first, among the
+    training views: those are drawn best.
+
+    These views are upright (or the one nearest to upright) and not nearer to the centre than half
+    of the training cameras (or the farthest). The first look most level and most directly at the
+    centre.
     """
     rig = analyse_cameras(capture)
     middle = float((rig.positions - rig.centre).norm(dim=1).median())
@@ -93,7 +99,8 @@ def choose_best_view(capture: Capture) -> int:
     fits = level >= min(LEVEL, float(level.max()))
     fits &= distance >= min(0.999 * middle, float(distance[fits].max()))
     score = (rotations[:, :, 2] * to_centre).sum(1) / distance.clamp_min(1e-12) * ups
-    return chosen[int(score.masked_fill(~fits, -math.inf).argmax())]
+    order = score.argsort(descending=True, stable=True).tolist()
+    return [chosen[i] for i in order if fits[i]]
 
 
 def median_depth(capture: Capture, position: Tensor, direction: Tensor) -> float:

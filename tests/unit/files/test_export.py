@@ -182,6 +182,11 @@ def test_a_live_page_knows_the_photographs_places_with_and_without_them(tmp_path
         export_run(opened.path, "html", refine=3)
     with pytest.raises(InputError, match=naming("--title", "compact")):
         export_run(opened.path, "compact", title="a")
+    with pytest.raises(InputError, match=naming("--photographs", "--data")):
+        export_run(opened.path, "html", photographs=True)  # the capture moved, and cameras.json is gone
+    for name in ("compact", "ply"):
+        with pytest.raises(InputError, match=naming("--photographs", "html", f"found {name}")):
+            export_run(opened.path, name, photographs=True)
 
 
 def test_defaults_lie_in_the_run_folder(run):

@@ -40,7 +40,7 @@ export function between(one, two, part) {
   const mix = (u, v) => (u === undefined || v === undefined ? v : u + (v - u) * part);
   return {
     position: add(one.position, add(two.position, one.position, -1), part), rotation: matrix(unit4(p.map((v, i) => a * v + b * q[i]))),
-    fov: mix(one.fov, two.fov), aspect: mix(one.aspect, two.aspect),
+    fov: mix(one.fov, two.fov), aspect: mix(one.aspect, two.aspect), fills: mix(one.fills, two.fills),
   };
 }
 
@@ -74,7 +74,7 @@ export class Camera {
   // Carries out a part of what is asked.
   step(seconds) {
     if (!this.moving) return false;
-    const { asked } = this, part = this.still ? 1 : 1 - Math.exp(-DAMPING * Math.min(seconds, 0.1));
+    const { asked } = this, part = this.still ? 1 : 1 - Math.exp(-DAMPING * seconds);
     const take = (list) => list.map((v) => v * part), [spin, pan, nearer] = [take(asked.spin), take(asked.pan), asked.nearer * part];
     asked.spin = add([...asked.spin, 0], [...spin, 0], -1).slice(0, 2);
     asked.pan = add([...asked.pan, 0], [...pan, 0], -1).slice(0, 2);

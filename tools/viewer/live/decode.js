@@ -2,7 +2,7 @@
 import { toHalf } from "./pack.js";
 import { GROUP, NONE, makeGroups } from "./scene.js";
 
-export const SLOT = 12; // words of a packed Gaussian: mean 3, covariance 6 (xx xy xz yy yz zz), colour and opacity as halves 2, none
+export const SLOT = 12; // words of a packed Gaussian: mean 3, covariance 6 (xx xy xz yy yz zz), colour and opacity as halves 2, expert
 
 const ACTIVATE = { opacity: Math.tanh, cov: (y) => y, color: (y) => 1 / (1 + Math.exp(-y)) };
 
@@ -121,7 +121,7 @@ export class CpuDecoder {
 
   // The Gaussians of opacity 1/255 or more as words [count, SLOT].
   pack() {
-    const { N, K } = this.scene, { opacity, cov, color } = this;
+    const { N, K, expert } = this.scene, { opacity, cov, color } = this;
     let count = 0;
     for (let s = 0; s < N * K; ++s) if (opacity[s] >= 1 / 255) ++count;
     const words = new Uint32Array(SLOT * count), real = new Float32Array(words.buffer);
@@ -142,6 +142,7 @@ export class CpuDecoder {
         real[at + 8] = p * c0 * c0 + q * c1 * c1 + w * c2 * c2;
         words[at + 9] = toHalf(color[3 * s]) | (toHalf(color[3 * s + 1]) << 16);
         words[at + 10] = toHalf(color[3 * s + 2]) | (toHalf(opacity[s]) << 16);
+        if (expert) words[at + 11] = expert[i];
         at += SLOT;
       }
     return words;

@@ -3,6 +3,7 @@ const WIDTH = 4095; // texels of a row of the texture; a Gaussian has three
 const VERTEX = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D;
 uniform usampler2D words; uniform mat4 view; uniform vec4 lens; uniform vec2 size; uniform bool antialias;
+uniform uint mask; uniform bool coloured; uniform vec3 palette[16];
 in uint id;
 out vec2 d; flat out vec4 color;
 void main() {
@@ -13,6 +14,7 @@ void main() {
   mat3 V = mat3(s.x, s.y, s.z, s.y, t.x, t.y, s.z, t.y, t.z);
   vec2 rg = unpackHalf2x16(w.y), ba = unpackHalf2x16(w.z);
   gl_Position = vec4(2, 2, 2, 1);
+  if ((mask >> w.w & 1u) == 0u) return;
   vec2 more = 0.15 * size / lens.xy, tan = clamp(m.xy / m.z, -lens.zw / lens.xy - more, (size - lens.zw) / lens.xy + more);
   mat3 rows = transpose(mat3(view));
   vec3 a = lens.x / m.z * (rows[0] - tan.x * rows[2]), b = lens.y / m.z * (rows[1] - tan.y * rows[2]);
@@ -26,7 +28,7 @@ void main() {
   d = vec2(float(gl_VertexID & 1), float(gl_VertexID >> 1)) * 2.0 - 1.0;
   vec2 at2 = lens.xy * m.xy / m.z + lens.zw + d.x * axis * sqrt(reach * wide) + d.y * vec2(-axis.y, axis.x) * sqrt(reach * max(det / wide, 1e-6));
   gl_Position = vec4(2.0 * at2.x / size.x - 1.0, 1.0 - 2.0 * at2.y / size.y, 0, 1);
-  color = vec4(rg, ba.x, opacity);
+  color = vec4(coloured ? palette[w.w] : vec3(rg, ba.x), opacity);
 }`;
 const FRAGMENT = `#version 300 es
 precision highp float;
@@ -123,6 +125,9 @@ export class GlRenderer {
     gl.uniform4f(draws.at("lens"), view.fx, view.fy, view.cx, view.cy);
     gl.uniform2f(draws.at("size"), width, height);
     gl.uniform1i(draws.at("antialias"), settings.antialias ? 1 : 0);
+    gl.uniform1ui(draws.at("mask"), view.look?.mask ?? 0xffffffff);
+    gl.uniform1i(draws.at("coloured"), view.look?.coloured ? 1 : 0);
+    if (settings.experts) gl.uniform3fv(draws.at("palette"), settings.experts.flat());
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindTexture(gl.TEXTURE_2D, this.words);

@@ -4,8 +4,9 @@ import { BLOCK, Sorter } from "./sort.js";
 
 const SPLAT = "struct Splat { mid: vec2f, axis: vec2f, minor: f32, opacity: f32, rg: u32, b: u32 }";
 // As our rasteriser defines it (render/reference.py). A key is the depth in units of the near plane, as 24 bits of its float: 16 octaves.
-const project = ({ exact, unit }, antialias) => `
-struct View { rows: array<vec4f, 3>, lens: vec4f, size: vec4f } // world to camera; fx fy cx cy; width, height, near, Gaussians
+// palette: RGB of the experts of a scene that has several; view.look then has a bit for each one that is drawn, and whether they are coloured.
+const project = ({ exact, unit, K }, antialias, palette) => `
+struct View { rows: array<vec4f, 3>, lens: vec4f, size: vec4f, look: vec4u } // world to camera; fx fy cx cy; width, height, near, Gaussians; look
 ${SPLAT}
 @group(0) @binding(0) var<storage, read> decoded: array<u32>;
 @group(0) @binding(1) var<uniform> view: View;
@@ -13,6 +14,9 @@ ${SPLAT}
 @group(0) @binding(3) var<storage, read_write> keys: array<u32>;
 @group(0) @binding(4) var<storage, read_write> ids: array<u32>;
 @group(0) @binding(5) var<storage, read_write> count: atomic<u32>;
+${palette ? `@group(0) @binding(6) var<storage, read> experts: array<u32>; // four in a word
+fn expertOf(s: u32) -> u32 { let i = s / ${K * slotWords(exact)}u; return (experts[i >> 2u] >> (8u * (i & 3u))) & 255u; }
+const PALETTE = array<vec3f, ${palette.length}>(${palette.map((c) => `vec3f(${c.join(", ")})`).join(", ")});` : ""}
 var<workgroup> here: atomic<u32>;
 var<workgroup> first: u32;
 var<private> splat: Splat;
@@ -22,6 +26,7 @@ const NONE = 0xffffffffu;
 fn ellipse(s: u32) -> u32 {
   var opacity = opacityOf(s);
   if (opacity < 1.0 / 255.0) { return NONE; }
+  ${palette ? "let expert = expertOf(s); if (((view.look.x >> expert) & 1u) == 0u) { return NONE; }" : ""}
   let m = vec4f(bitcast<f32>(decoded[s]), bitcast<f32>(decoded[s + 1u]), bitcast<f32>(decoded[s + 2u]), 1);
   let p = vec3f(dot(view.rows[0], m), dot(view.rows[1], m), dot(view.rows[2], m));
   if (p.z <= view.size.z) { return NONE; }
@@ -41,7 +46,7 @@ fn ellipse(s: u32) -> u32 {
   let half = 0.5 * (xx + yy); let rad = length(vec2f(0.5 * (xx - yy), xy)); let long = half + rad;
   var axis = vec2f(select(0.0, 1.0, xx >= yy), select(1.0, 0.0, xx >= yy));
   if (abs(xy) > 1e-9) { axis = normalize(vec2f(xy, long - xx)); }
-  let c = colorOf(s);
+  ${palette ? "var palette = PALETTE; let c = select(colorOf(s), palette[expert], view.look.y == 1u);" : "let c = colorOf(s);"}
   splat = Splat(mid, axis * sqrt(reach * long), sqrt(reach * max(det / long, 1e-6)), opacity, pack2x16float(c.xy), pack2x16float(vec2f(c.z, 0)));
   return min((bitcast<u32>(p.z / view.size.z) - 0x3f800000u) >> 3u, 0xffffffu);
 }
@@ -153,6 +158,12 @@ export class Gpu {
   }
 }
 
+// Bytes in whole words.
+const padded = (bytes) => {
+  const out = new Uint8Array(4 * Math.ceil(bytes.length / 4));
+  out.set(bytes);
+  return out;
+};
 const OVER = { srcFactor: "one", dstFactor: "one-minus-src-alpha" };
 export class GpuRenderer {
   // The largest buffer of a scene, in bytes.
@@ -165,7 +176,7 @@ export class GpuRenderer {
     const { UNIFORM, STORAGE, INDIRECT } = GPUBufferUsage, slots = (this.slots = scene.N * scene.K);
     const anchors = gpu.buffer(scene.anchors.byteLength, scene.anchors);
     this.decoded = gpu.buffer(4 * slots * slotWords(scene.exact));
-    [this.camera, this.view, this.size, this.back] = [16, 80, 16, 16].map((size) => gpu.buffer(size, null, UNIFORM));
+    [this.camera, this.view, this.size, this.back] = [16, 96, 16, 16].map((size) => gpu.buffer(size, null, UNIFORM));
     this.heads = scene.heads.map((head) => {
       const own = [head.networks, head.perm, head.experts].map((data) => gpu.buffer(data.byteLength, data));
       const share = head.width > 1 ? [gpu.buffer(head.share.byteLength, head.share)] : [];
@@ -175,7 +186,9 @@ export class GpuRenderer {
     this.args = gpu.buffer(32, null, STORAGE | INDIRECT);
     this.sorter = new Sorter(gpu, slots, this.count, this.args);
     const splats = gpu.buffer(32 * slots);
-    this.project = gpu.compute(project(scene, settings.antialias), [this.decoded, this.view, splats, this.sorter.keys, this.sorter.ids, this.count]);
+    const experts = scene.expert ? [gpu.buffer(scene.expert.length, padded(scene.expert))] : [];
+    const resources = [this.decoded, this.view, splats, this.sorter.keys, this.sorter.ids, this.count, ...experts];
+    this.project = gpu.compute(project(scene, settings.antialias, scene.expert && settings.experts), resources);
     this.counted = gpu.compute(ARGS, [this.count, this.args]);
     this.draws = gpu.pipeline(DRAW, "rgba16float", "triangle-strip", { color: OVER, alpha: OVER });
     this.drawn = gpu.bind(this.draws, [splats, this.sorter.ids, this.size]);
@@ -198,8 +211,9 @@ export class GpuRenderer {
   render(view, fresh) {
     const { device } = this.gpu, { width, height } = view, encoder = device.createCommandEncoder();
     this.resize(width, height);
-    const numbers = new Float32Array([...view.rows.flat(), view.fx, view.fy, view.cx, view.cy, width, height, view.near, 0]);
-    new Uint32Array(numbers.buffer)[19] = this.slots;
+    const numbers = new Float32Array(24);
+    numbers.set([...view.rows.flat(), view.fx, view.fy, view.cx, view.cy, width, height, view.near]);
+    new Uint32Array(numbers.buffer).set([this.slots, view.look?.mask ?? 0xffffffff, view.look?.coloured ? 1 : 0], 19);
     device.queue.writeBuffer(this.view, 0, numbers);
     device.queue.writeBuffer(this.size, 0, new Float32Array([width, height, 0, 0]));
     encoder.clearBuffer(this.count);

@@ -77,6 +77,7 @@ export function packScene(scene, exact) {
   const unit = unitOf(scene), sizes = ({ name, E, H, D, out, far }) => ({ name, E, H, D, out, far });
   return {
     N: scene.N, F: scene.F, K: scene.K, levels: scene.levels, smoothing: scene.smoothing, unit, exact, anchors: packAnchors(scene, unit, exact),
+    expert: scene.expert?.slice() ?? null,
     heads: scene.heads.map((head) => ({ ...sizes(head), ...makeGroups(head, scene.N), networks: packNetworks(head, exact) })),
   };
 }

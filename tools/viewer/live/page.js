@@ -1,9 +1,11 @@
 // The page: one scene from data inside it alone, decoded and drawn here, and the hands that move through it.
 import { Camera, add, between, length, viewOf } from "./camera.js";
+import { listExperts, listPlaces, makePhotograph, show } from "./panels.js";
 import { openRenderer } from "./renderers.js";
 
 const FLIGHT = 16; // seconds of a round
 const JUMP = 0.9; // seconds from one place to another
+const LONGEST = 0.5; // seconds of flying by keys that one frame carries out
 const REST = 250; // milliseconds without news until the picture is final
 const SLOW = 40, QUICK = 18, LEAST = 0.35; // milliseconds of a frame that lower and raise the resolution; its smallest share
 const WIDEST = 100; // degrees
@@ -22,7 +24,7 @@ export class Page {
     this.veil = find("veil");
     this.veil.style.setProperty("--back", `rgb(${settings.background.map((v) => Math.round(255 * v))})`);
     this.listen();
-    this.setPose(settings.pose);
+    this.setPose(this.first());
     this.readHash();
   }
 
@@ -71,51 +73,20 @@ export class Page {
     on(this.near, "change", () => this.take());
     if (!this.settings.reach) this.near.parentElement.hidden = !(this.near.checked = false);
     const acts = { home: () => this.home(), previous: () => this.step(-1), next: () => this.step(1), whole: () => this.whole(),
-      ask: () => this.show("ask", "help"), close: () => this.show("ask", "help"), flight: () => this.flyAround() };
+      ask: () => show("help"), close: () => show("help"), flight: () => this.flyAround() };
     for (const [name, act] of Object.entries(acts)) on(find(name), "click", act);
+    if (this.settings.experts) listExperts(this.settings.experts, (look) => ((this.look = look), this.wake()));
     find("flight").hidden = this.settings.flight.length < 2;
+    if (this.settings.poses.some((pose) => pose.picture)) this.photograph = makePhotograph(this);
     if (this.settings.poses.length < 2) return void (find("previous").hidden = find("next").hidden = true);
-    this.listPlaces();
-  }
-
-  // A button and a list: the places of the photographs; a click flies to one.
-  listPlaces() {
-    const make = (name, properties) => Object.assign(document.createElement(name), properties);
-    const button = make("button", { id: "places", textContent: "photographs", title: "places of the photographs" });
-    const list = make("section", { id: "list", hidden: true, tabIndex: 0 });
-    list.setAttribute("aria-label", "places of the photographs");
-    button.setAttribute("aria-expanded", "false");
-    button.setAttribute("aria-controls", "list");
-    list.style.cssText = "position:fixed;left:10px;max-width:min(25rem,calc(100vw - 20px));max-height:40vh;overflow:auto;background:#1c1c1cf2;border-radius:8px;padding:8px";
-    this.settings.poses.forEach((pose, i) => {
-      const place = make("button", { textContent: String(i + 1), title: `fly to photograph ${i + 1}` });
-      place.setAttribute("aria-label", `fly to photograph ${i + 1}`);
-      place.style.margin = "2px";
-      place.addEventListener("click", () => ((this.index = i), this.flyTo(pose)));
-      list.append(place);
-    });
-    button.addEventListener("click", () => this.show("places", "list"));
-    find("next").after(button);
-    find("bar").style.flexWrap = "wrap";
-    find("bar").after(list);
-  }
-
-  // Opens or closes what a button controls; without `open`, the other one of the two.
-  show(button, panel, open) {
-    const isOpen = open ?? find(panel)?.hidden, above = `${find("bar").offsetHeight + 20}px`;
-    for (const [by, what] of [["ask", "help"], ["places", "list"]]) {
-      if (!find(what)) continue;
-      find(what).hidden = !(isOpen && what === panel);
-      find(what).style.bottom = above;
-      find(by).setAttribute("aria-expanded", String(!find(what).hidden));
-      if (what === "list") find(what).style.display = find(what).hidden ? "none" : "block";
-    }
+    listPlaces(this.settings.poses, (i) => ((this.index = i), this.flyTo(this.settings.poses[i])));
   }
 
   // Somebody takes the camera.
   take() {
     this.held = false;
     this.flight = this.jump = null;
+    this.photograph?.();
     this.wake();
   }
 
@@ -154,13 +125,20 @@ export class Page {
   press(event) {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     const act = { KeyR: () => this.home(), KeyF: () => this.whole(), BracketLeft: () => this.step(-1), BracketRight: () => this.step(1),
-      KeyL: () => this.writeHash(), KeyH: () => this.show("ask", "help"), Escape: () => this.show("ask", "help", false), KeyP: () => this.flyAround() }[event.code];
+      KeyL: () => this.writeHash(), KeyH: () => show("help"), Escape: () => show("help", false), KeyP: () => this.flyAround() }[event.code];
     if (act) act();
     else if (/^(Key[WASDQE]|Arrow)/.test(event.code) && !/^(INPUT|SECTION)$/.test(event.target.tagName)) (this.keys.add(event.code), this.take());
     this.wake();
   }
 
-  home() { this.index = this.settings.index; this.flyTo(this.settings.pose); }
+  home() { this.index = this.settings.index; this.flyTo(this.first()); }
+
+  // The first view of this screen: that of the nearest aspect, cut to the screen's (`fills`); without any, the best photograph's.
+  first() {
+    const screen = Math.log(innerWidth / innerHeight), away = ({ aspect }) => Math.abs(Math.log(aspect) - screen);
+    const found = [...this.settings.first].sort((a, b) => away(a) - away(b))[0];
+    return found ? { ...found, fills: 1 } : this.settings.pose;
+  }
 
   step(by) {
     const n = this.settings.poses.length;
@@ -173,14 +151,16 @@ export class Page {
   flyAround() {
     this.flight = this.flight === null && this.settings.flight.length > 1 ? 0 : null;
     this.jump = null;
+    this.photograph?.();
     this.wake();
   }
 
   flyTo(pose) {
+    this.photograph?.();
     if (isCalm() || !this.renderer) return this.setPose(pose);
     this.flight = null;
     this.held = false;
-    this.jump = { from: { ...this.camera.pose(), fov: this.fov, aspect: this.aspect }, to: { ...pose, fov: pose.fov ?? this.settings.fov }, part: 0 };
+    this.jump = { from: { ...this.camera.pose(), fov: this.fov, aspect: this.aspect, fills: this.fills }, to: { ...pose, fov: pose.fov ?? this.settings.fov, fills: pose.fills ?? 0 }, part: 0 };
     this.wake();
   }
 
@@ -189,6 +169,7 @@ export class Page {
     this.flight = this.jump = null;
     this.place(pose);
     this.held = true;
+    this.photograph?.(pose.picture);
     this.wake();
   }
 
@@ -196,14 +177,16 @@ export class Page {
     this.camera.set(pose);
     this.fov = pose.fov ?? this.settings.fov;
     this.aspect = pose.aspect ?? this.aspect ?? this.settings.pose.aspect;
+    this.fills = pose.fills ?? 0;
     this.fit();
   }
 
   pose() { return { ...this.camera.pose(), fov: this.fov }; }
 
-  // The field of view that this screen has: a wide screen is filled by the photograph, a narrow one shows about half more of its width.
+  // The field of view that this screen has: a wide screen is filled by the photograph, a narrow one shows about half more of its width, or
+  // is filled too (`fills` 1).
   fit() {
-    const screen = innerWidth / innerHeight, ratio = this.aspect ? this.aspect / screen : 1, factor = ratio < 1 ? ratio : Math.sqrt(ratio);
+    const screen = innerWidth / innerHeight, ratio = this.aspect ? this.aspect / screen : 1, factor = ratio < 1 ? ratio : ratio ** (0.5 - 0.5 * this.fills);
     const tan = Math.tan((this.fov * Math.PI) / 360);
     this.shown = Math.min(WIDEST, (360 / Math.PI) * Math.atan(factor * tan));
     const share = tan / Math.tan((this.shown * Math.PI) / 360); // of the screen's height that the photograph has
@@ -231,16 +214,18 @@ export class Page {
     this.canvas.width = Math.max(1, Math.round(innerWidth * ratio));
     this.canvas.height = Math.max(1, Math.round(innerHeight * ratio));
     this.canvas.style.cssText = "width:100vw;height:100vh";
+    if (this.fills === 1 && this.held) this.place(this.first()); // the first view of a phone that was turned
     this.fit();
     this.wake();
   }
 
   view(scale = 1) {
     const width = Math.max(1, Math.round(this.canvas.width * scale)), height = Math.max(1, Math.round(this.canvas.height * scale));
-    return viewOf(this.camera.pose(), this.shown, width, height, this.settings.nearest);
+    return { ...viewOf(this.camera.pose(), this.shown, width, height, this.settings.nearest), look: this.look };
   }
 
-  // Moves the camera by what keys, hands, a flight or a jump ask for. Returns whether it moved.
+  // Moves the camera by what keys, hands, a flight or a jump ask for in some seconds: where it is depends on the clock, not on the number of
+  // frames. Returns whether it moved.
   move(seconds) {
     const { camera, settings, keys } = this, on = (...names) => (names.some((name) => keys.has(name)) ? 1 : 0);
     if (this.jump) {
@@ -257,7 +242,7 @@ export class Page {
     }
     const fly = [on("KeyD", "ArrowRight") - on("KeyA", "ArrowLeft"), on("KeyQ") - on("KeyE"), on("KeyW", "ArrowUp") - on("KeyS", "ArrowDown")];
     const flies = fly.some(Boolean), moved = camera.step(seconds);
-    if (flies) camera.fly(fly.map((v) => v * settings.speed * seconds));
+    if (flies) camera.fly(fly.map((v) => v * settings.speed * Math.min(seconds, LONGEST)));
     if (moved || flies) this.stay(flies);
     return moved || flies;
   }
@@ -287,7 +272,7 @@ export class Page {
   }
 
   async frame(now) {
-    const { wishes } = this, passed = this.last === null ? 0 : now - this.last, moves = this.move(Math.min(passed / 1000, 0.1));
+    const { wishes } = this, passed = this.last === null ? 0 : now - this.last, moves = this.move(passed / 1000);
     this.last = now;
     if (moves) this.news = performance.now();
     const isResting = performance.now() - this.news >= REST || this.held && !moves;

@@ -74,6 +74,17 @@ function makeHead(name, compact, scene, settings) {
   return { ...head, w1, b1, w2: weights(get("experts.w2")), b2: weights(get("experts.b2")), routing: route(head, router, scene, settings) };
 }
 
+// The expert of each anchor: the one with the largest weight for its colours, or of the last head that has several.
+function strongest(heads) {
+  const { k, routing } = heads.findLast((head) => head.routing), out = new Uint8Array(routing.chosen.length / k);
+  for (let i = 0; i < out.length; ++i) {
+    let best = i * k;
+    for (let j = 1; j < k; ++j) if (routing.share[i * k + j] > routing.share[best]) best = i * k + j;
+    out[i] = routing.chosen[best];
+  }
+  return out;
+}
+
 // compact: what readCompact returns.
 export function makeScene(compact, settings) {
   const { header, groups, cells, lattice } = compact, { N, F, K } = header, classes = groups.class[0], extra = { interval: null, extra_level: null };
@@ -93,6 +104,7 @@ export function makeScene(compact, settings) {
     live: groups.slots ?? null,
   };
   scene.heads = HEADS.map((name) => makeHead(name, compact, scene, settings));
+  scene.expert = settings.experts ? strongest(scene.heads) : null;
   return scene;
 }
 

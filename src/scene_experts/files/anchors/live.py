@@ -2,13 +2,16 @@
 
 The page holds the compact file of a scene of anchors and a script (tools/viewer/live) that decodes
 it for the position of the camera, with WebGPU, or without it with WebGL 2. The note has the entries
-that html's has, and `nearest`, the depth up to which nothing is drawn. What nothing covers shows
-the scene's own background: trainings leave dark things transparent before it, so that another
-colour would be wrong.
+that html's has, `first`, entries of cameras whose views fill screens of their aspects, `pictures`,
+small photographs of the entries in `cameras` as WebP files, and `nearest`, the depth up to which
+nothing is drawn. What nothing covers shows the scene's own
+background: trainings leave dark things transparent before it, so that another colour would be
+wrong.
 """
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,13 +23,15 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_bytes
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.source import opening
-from scene_experts.data.views import Capture, World
+from scene_experts.data.views import Capture, View, World
 from scene_experts.files.anchors import compact
 from scene_experts.files.anchors.data import AnchorData
 from scene_experts.files.anchors.quality import choose_precision
 from scene_experts.files.anchors.rounding import distance_exponent
+from scene_experts.files.anchors.thumbnails import BYTES, make_thumbnails
+from scene_experts.files.cameras import camera_entries
 from scene_experts.files.formats import html
-from scene_experts.files.measure import Tell
+from scene_experts.files.measure import Painter, Tell
 from scene_experts.files.options import Options
 from scene_experts.files.registry import Format
 from scene_experts.files.result_folder import file_world
@@ -34,13 +39,15 @@ from scene_experts.render import Rasterizer
 from scene_experts.scene.anchors.levels import Levels
 from scene_experts.scene.anchors.mlp import ATTRIBUTES
 from scene_experts.training.run_folder import OpenRun
+from scene_experts.view.filled import find_first_views
+from scene_experts.view.paint import PALETTE
 
 BAKED = "baked-html"
 GENERATOR = "scene-experts live"
 MARK = f'<meta name="generator" content="{GENERATOR}">'.encode()
 LICENCE = "scene-experts, Apache-2.0"
 CODE = "live.min.js.gz"
-SPARE = 1000  # bytes for a title, and for numbers that are longer in the frame of the page
+SPARE = 4000  # bytes for a title, first views, and numbers that are longer in the frame of the page
 ROUTERS = {"Linear": "softmax", "Places": "softmax", "Margin": "margin", "Balanced": "balanced"}
 """Routers by the type in a description -> how the script weighs the experts that they choose."""
 LARGEST_HALF = 60_000.0  # beyond it the script holds values in 32 bits
@@ -53,9 +60,10 @@ def write(path: Path, data: AnchorData, note: dict[str, Any]) -> str:
     cannot draw, and as `compact.write`."""
     expect_drawable(data)
     encoded, sizes = compact.encode(data)
-    page = make_page(data, note, encoded)
+    page, pictures = make_page(data, note, encoded), sum(4 * ((len(picture) + 2) // 3) for picture in note.get("pictures", ()))
     write_bytes(Path(path), page)
-    return f"{len(page) - 4 * ((len(encoded) + 2) // 3):,} bytes of page and script, {sizes}"
+    photographs = f"{pictures:,} bytes of photographs, " if pictures else ""
+    return f"{len(page) - 4 * ((len(encoded) + 2) // 3) - pictures:,} bytes of page and script, {photographs}{sizes}"
 
 
 def make_page(data: AnchorData, note: Mapping[str, Any], encoded: bytes) -> bytes:
@@ -102,19 +110,28 @@ def page_settings(data: AnchorData, note: Mapping[str, Any]) -> dict[str, Any]:
     view = html.view_settings(places - centre, note, centre)
     for name in ("near", "far"):
         del view[name]
+    pictures = note.get("pictures") or [b""] * len(view["poses"])
     return {
         "count": len(places) * about["K"],
         "centre": centre.tolist(),
         **view,
+        "poses": [pose | _picture(picture) for pose, picture in zip(view["poses"], pictures)],
+        "first": [html.pose_of(entry, centre) for entry in note.get("first") or []],
         "nearest": float(note.get("nearest") or view["distance"] / 500),
         "background": [float(v) for v in note.get("background", (0.0, 0.0, 0.0))],
         "antialias": about["train"].get("antialias") is True,
         "heads": {a: _head(a, data) for a in ATTRIBUTES},
+        "experts": _palette(data),
         "router": _positions(about, centre),
         "levels": _levels(about),
         "smoothing": float(config.get("smoothing", 0.0)) if "interval" in data.columns else 0.0,
         "exact": not _fits_halves(data),
     }
+
+
+def _picture(picture: bytes) -> dict[str, str]:
+    """The entry of a pose whose photograph is in the page."""
+    return {"picture": f"data:image/webp;base64,{base64.b64encode(picture).decode()}"} if picture else {}
 
 
 def _head(attribute: str, data: AnchorData) -> dict[str, Any]:
@@ -130,6 +147,16 @@ def _head(attribute: str, data: AnchorData) -> dict[str, Any]:
         "position": f"{attribute}.router.weight" in networks and networks[f"{attribute}.router.weight"].shape[1] > about["F"],
         "distance": 2.0**exponent,
     }
+
+
+def _palette(data: AnchorData) -> list[tuple[float, float, float]] | None:
+    """The colours of the experts that anchors have; None for one network, and for more than there are
+    colours."""
+    for attribute in reversed(ATTRIBUTES):
+        if _head(attribute, data)["alone"] is None:
+            count = len(data.networks[f"{attribute}.experts.w1"])
+            return list(PALETTE[:count]) if count <= len(PALETTE) else None
+    return None
 
 
 def _positions(about: dict[str, Any], centre: Tensor) -> dict[str, Any]:
@@ -161,6 +188,15 @@ def view_note(capture: Capture, world: World) -> dict[str, Any]:
     return html.view_note(capture, world) | near
 
 
+def look(run: OpenRun, capture: Capture, world: World, options: Options, rasterize: Rasterizer | None) -> dict[str, Any]:
+    """The entries `first` and `pictures` of a note. See `registry.Format.look`, `view.filled` and
+    `thumbnails`."""
+    pictures = {"pictures": make_thumbnails(capture)} if options.photographs else {}
+    painter, black = Painter.of(run.scene, run.step, rasterize, run.config.train.antialias), torch.zeros(3)
+    found = find_first_views(capture, lambda camera: painter.rasterize(painter.gaussians(camera), camera, black))
+    return {"first": camera_entries([View("first", view.camera, Path()) for view in found], world), **pictures}
+
+
 def fit(
     run: OpenRun,
     contents: AnchorData,
@@ -174,9 +210,10 @@ def fit(
     expect_drawable(contents)
 
     note = {} if capture is None or options.target_mb == 0 else view_note(capture, world)
+    spare = SPARE + (BYTES * 4 // 3 if options.photographs else 0)
 
     def size(data: AnchorData) -> int:
-        return SPARE + len(make_page(data, note, compact.encode(data)[0]))
+        return spare + len(make_page(data, note, compact.encode(data)[0]))
 
     return choose_precision(run, contents, world, options, capture, rasterize, tell, size)
 
@@ -189,6 +226,7 @@ FORMAT = Format(
     marks=(b"<!doctype html>",),
     looks_like=lambda path, head: MARK in head,
     view_note=view_note,
+    look=look,
     fit=fit,
     otherwise=BAKED,
     lacks=find_unknown,

@@ -96,8 +96,8 @@ def _fit(
 ) -> GroupModel:
     """The model of one group. inputs [D, n] of the last channel (and the group's own), values [C,
     n], classes [n], live [slots, n]."""
-    X = torch.from_numpy(inputs.T.astype(np.float32) / UNIT)
-    y, k = torch.from_numpy(values.T.astype(np.float32)), torch.from_numpy(classes.astype(np.float32))[:, None]
+    X = torch.from_numpy(np.ascontiguousarray(inputs.T, np.float32) / UNIT)
+    y, k = torch.from_numpy(np.ascontiguousarray(values.T, np.float32)), torch.from_numpy(classes.astype(np.float32))[:, None]
     n, C = y.shape
     seen = torch.ones(n, C) if live is None else torch.from_numpy(np.repeat(live, group.masked, 0).T.astype(np.float32))
     mask = torch.zeros(C, X.shape[1])
@@ -142,11 +142,12 @@ def _descend(
     adam = _Descent([mean, bias, spread, start], min(STEPS, n // PER_STEP))
     price, log_deviation = PRICE / n, deviation.log()
     for rows in adam.rows(n):
-        x, own, weight = X[rows], k[rows], seen[rows] / min(BATCH, n)
+        x, own = X.index_select(0, rows), k.index_select(0, rows)
+        weight = seen.index_select(0, rows) / min(BATCH, n)
         factor = 2.0**-own
         m = (middle + deviation * (bias + x @ mean.T)) * factor
         log_scale = start + x @ spread.T + log_deviation - own * math.log(2)
-        _, by_away, by_spread = find_slopes(y[rows] - m, log_scale)
+        _, by_away, by_spread = find_slopes(y.index_select(0, rows) - m, log_scale)
         by_mean, by_spread = by_away.mul_(weight).mul_(-deviation * factor), by_spread.mul_(weight)
         moved = means * mask
         adam.move(

@@ -183,8 +183,8 @@ def view_settings(places: Tensor, note: Mapping[str, Any], centre: Tensor) -> di
     places: [N, 3] where the scene is, relative to `centre` [3], a place in the frame of the note.
     """
     means = places.double().numpy()
-    poses = [_pose(entry, centre) for entry in note.get("cameras") or []]
-    first = _pose(note["camera"], centre) if note.get("camera") else poses[0] if poses else _from_outside(means)
+    poses = [pose_of(entry, centre) for entry in note.get("cameras") or []]
+    first = pose_of(note["camera"], centre) if note.get("camera") else poses[0] if poses else _from_outside(means)
     poses = poses or [first]
     up = estimate_up(torch.tensor([pose["rotation"] for pose in poses], dtype=torch.float64))
     distance = _distance(means, first)
@@ -192,7 +192,7 @@ def view_settings(places: Tensor, note: Mapping[str, Any], centre: Tensor) -> di
     return {
         "pose": first,
         "poses": poses,
-        "flight": [_pose(entry, centre) for entry in note.get("flight") or []],
+        "flight": [pose_of(entry, centre) for entry in note.get("flight") or []],
         "index": poses.index(first) if first in poses else 0,
         "fov": first["fov"],
         "up": up.tolist(),
@@ -204,7 +204,8 @@ def view_settings(places: Tensor, note: Mapping[str, Any], centre: Tensor) -> di
     }
 
 
-def _pose(entry: Mapping[str, Any], centre: Tensor) -> Pose:
+def pose_of(entry: Mapping[str, Any], centre: Tensor) -> Pose:
+    """The pose of an entry of the note, relative to `centre` [3]. Raises InputError for an invalid one."""
     try:
         position = np.array(entry["position"], np.float64).reshape(3) - centre.numpy()
         rotation = np.array(entry["rotation"], np.float64).reshape(3, 3)

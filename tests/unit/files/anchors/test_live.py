@@ -15,8 +15,11 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.files.anchors import compact, live
 from scene_experts.files.formats import html
+from scene_experts.files.options import DEFAULT
 from scene_experts.files.registry import recognise
-from support.live_scenes import CASES, compare, contents_of, decoded, look, make_run, scene_in_page
+from scene_experts.view.filled import First
+from scene_experts.view.paint import PALETTE
+from support.live_scenes import CASES, WORLD, compare, contents_of, decoded, look, make_run, scene_in_page
 from support.messages import naming
 from support.places import ROOT
 from support.splats import splats
@@ -65,6 +68,40 @@ def test_settings_say_how_to_decode(tmp_path):
     }
     assert found["background"] == [0.1, 0.2, 0.3] and found["nearest"] == 0.004
     assert found["exact"] is False and found["levels"] is None and len(found["poses"]) == 1
+
+
+def test_settings_have_a_colour_for_each_of_several_experts(tmp_path):
+    for case, count in (("scene-experts", 5), ("moe-gs-e3-dense", 3), ("scaffold-gs", None)):
+        write(tmp_path / "a.html", case)
+        found = settings_of(tmp_path / "a.html")["experts"]
+        assert found is None if count is None else [tuple(color) for color in found] == list(PALETTE[:count])
+
+
+def test_first_views_are_those_that_fill_screens(tmp_path, monkeypatch):
+    """They are chosen by pictures of the scene, and are in the frame of the page."""
+    run, asked = make_run("scaffold-gs"), []
+
+    def find(capture, draw):
+        picture = draw(SEEN.camera)
+        asked.append((capture, picture.alpha.shape, float(picture.alpha.max())))
+        return [First(SEEN.camera, 1.0)]
+
+    monkeypatch.setattr(live, "find_first_views", find)
+    note = live.look(run, "a capture", WORLD, DEFAULT, None)
+    assert asked[0][:2] == ("a capture", (240, 320)) and asked[0][2] > 0.1
+    live.write(tmp_path / "a.html", contents_of(run), {"cameras": [SEEN.pose], **note})
+    found = settings_of(tmp_path / "a.html")
+    place = np.array(found["first"][0]["position"]) + found["centre"]
+    np.testing.assert_allclose(place, SEEN.pose["position"], atol=1e-5)
+    assert found["first"][0]["fov"] == pytest.approx(50, abs=1e-3) and found["first"][0]["aspect"] == pytest.approx(4 / 3)
+
+
+def test_photographs_are_in_the_poses_and_in_the_size(tmp_path):
+    run = make_run("scaffold-gs")
+    plain = live.write(tmp_path / "a.html", contents_of(run), {"cameras": [SEEN.pose, SEEN.pose]})
+    told = live.write(tmp_path / "b.html", contents_of(run), {"cameras": [SEEN.pose, SEEN.pose], "pictures": [b"", b"RIFF...."]})
+    assert [pose.get("picture") for pose in settings_of(tmp_path / "b.html")["poses"]] == [None, "data:image/webp;base64,UklGRi4uLi4="]
+    assert "photographs" not in plain and ", 12 bytes of photographs, " in told
 
 
 def test_values_that_no_half_holds_are_held_in_32_bits(tmp_path):
