@@ -125,6 +125,8 @@ def reconstruct(
                 f"expected overlapping photographs of one scene in {source}, found none that fit together; take more sharp photographs "
                 f"from different places, each showing most of what the previous one shows (COLMAP's log: {folder / LOG})"
             )
+        if warning := warn_of_mapper(result, options):
+            say(warning)
         note = describe_result(result, found, options, time.monotonic() - began, copied=not own, exhaustive=len(pairs) == every)
         write_json(folder / work.DONE / NOTE, note)
         work.publish(out)
@@ -151,8 +153,8 @@ def run_features(
     result = run(request)
     if not attempt.is_wanted(options.features, result, len(shots.names), say):
         return result
-    model = Path(request["model"])
-    again = {**request, "maps": str(folder / "maps" / "learned"), "model": str(folder / "maps" / "learned-model")}
+    model, mapper = Path(request["model"]), "incremental" if options.mapper == "auto" else options.mapper
+    again = {**request, "maps": str(folder / "maps" / "learned"), "model": str(folder / "maps" / "learned-model"), "mapper": mapper}
     some = attempt.choose_pairs(pairs, spare, shots.names, result["lacking"])
     try:
         other = attempt.reconstruct_with(shots, some, again, run, say, progress)
@@ -160,6 +162,17 @@ def run_features(
         say(f"warning: the result without learned features is kept, because they failed: {error}")
         return result
     return attempt.keep_better(result, other, len(shots.names), (model, Path(again["model"])), say)
+
+
+def warn_of_mapper(result: dict[str, Any], options: SfmOptions) -> str | None:
+    """Return a warning if the poses are those of the global mapper after the incremental one had
+    failed: it may give every photograph a pose, and wrong ones."""
+    if options.mapper != "auto" or result.get("mapper") != "global":
+        return None
+    return (
+        "warning: these poses are those of the global mapper, because the incremental one fitted too few photographs together; "
+        "they may be wrong: look at the scene, or take photographs between these"
+    )
 
 
 def check_request(source: Path, out: Path, overwrite: bool) -> None:

@@ -311,6 +311,7 @@ def test_learned_features_are_tried_where_colmaps_fail_and_the_better_result_is_
     assert not requests[0]["learned"] and requests[1]["learned"].endswith("all.npz") and requests[1]["names"] == ["0.jpg", "1.jpg", "2.jpg"]
     assert (tmp_path / "out" / PLACES["model"] / "cameras.bin").read_text() == "of request 2"
     assert note["with_pose"] == 2 and note["features"] == "SIFT and ALIKED" and "lacking" not in note
+    assert [request["mapper"] for request in requests] == ["auto", "incremental"]  # poses of the other mapper are not trusted
     assert any("2 of 3" in line for line in said) and not (tmp_path / "out" / NAME).exists()
 
 
@@ -341,3 +342,11 @@ def test_poses_of_colmaps_features_are_kept_where_the_networks_fail(tmp_path, mo
     said = []
     note = run.reconstruct(write_black(tmp_path / "photos"), tmp_path / "out", SfmOptions(), say=said.append)
     assert note["with_pose"] == 2 and "features" not in note and any("weights of another version" in line for line in said)
+
+
+@pytest.mark.parametrize(("mapper", "asked", "warned"), [("global", "auto", 1), ("global", "global", 0), ("incremental", "auto", 0)])
+def test_poses_of_the_second_mapper_get_a_warning(tmp_path, monkeypatch, mapper, asked, warned):
+    said = []
+    monkeypatch.setattr(run, "run_worker", fake_worker(**{**FOUND, "mapper": mapper, "lacking": []}))
+    run.reconstruct(write_black(tmp_path / "photos"), tmp_path / "out", SfmOptions(mapper=asked), say=said.append)
+    assert sum("warning" in line and "global mapper" in line for line in said) == warned

@@ -16,9 +16,9 @@ from scene_experts.core.progress import Progress
 from scene_experts.sfm.learned import photographs
 from scene_experts.sfm.learned.weights import INSTALL, find_weights, load_networks
 from scene_experts.sfm.options import Features
+from scene_experts.sfm.pairs import MOST_EXHAUSTIVE
+from scene_experts.sfm.worker import ENOUGH
 
-ENOUGH = 0.9  # fraction of photographs with a pose from the first mapper at which COLMAP's features suffice
-FEW = 30  # photographs of which all pairs are matched anew; of more, those with a photograph without a pose
 MOST = 3000  # pairs, unless asked for: nearly an hour of a core
 
 Worker = Callable[[dict[str, Any]], dict[str, Any]]
@@ -55,7 +55,7 @@ def choose_pairs(
     """Return the pairs that are matched by learned features, of those that COLMAP has matched: all of
     few photographs, otherwise those with a photograph in `lacking`. Of more than MOST, those in
     `spare` are left out, and of the others MOST are taken, evenly spread."""
-    if len(names) <= FEW:
+    if len(names) <= MOST_EXHAUSTIVE:
         return sorted({*pairs, *spare})
     without = set(lacking)
     some = [pair for pair in sorted({*pairs, *spare}) if without.intersection(names[i] for i in pair)]
@@ -92,8 +92,8 @@ def keep_better(
     """Return the result that is kept: `one` of COLMAP's features or `other`, with learned ones. Its
     model is moved to the first of the `models`.
 
-    Learned keypoints are less precise, so `other` needs more poses than the first mapper found for
-    `one`, and as many as its second. total: Number of photographs.
+    `other` needs more poses than the first mapper found for `one`, and as many as its second:
+    otherwise COLMAP's own result stays, as it is without the networks. total: Number of photographs.
     """
     poses = [(len(result["registered"]), result.get("points", 0)) for result in (one, other)]
     say("poses: " + ", ".join(f"{count} with {points:,} points from {what}" for (count, points), what in zip(poses, KINDS, strict=True)))

@@ -54,7 +54,7 @@ def test_of_many_photographs_those_without_a_pose_are_matched():
     [
         ("cdef", "abcdef", "other"),  # as many poses as the second mapper's, which are not trusted
         ("cdef", "abcde", "model"),
-        ("", "abcdef", "model"),  # no more poses than the first mapper's, which are more precise
+        ("", "abcdef", "model"),  # no more poses than the first mapper's
         ("ef", "abcdef", "other"),
     ],
 )
