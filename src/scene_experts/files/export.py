@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import check_writable, write_bytes, write_json
 from scene_experts.data.views import Capture, World
+from scene_experts.files.accepted import FITTED, check_values, expect_drawn, expect_fitted, expect_unused
 from scene_experts.files.measure import OF_THE_FORMAT, Tell, capture_if_there, cost
-from scene_experts.files.options import DEFAULT, MAX_DEGREE, Options
+from scene_experts.files.options import DEFAULT, Options
 from scene_experts.files.placed import AROUND, place_cameras
 from scene_experts.files.registry import GAUSSIANS, Family, Format, Note, family_named, format_named, format_names, formats_of
 from scene_experts.files.scene_folder import origin_note, origin_of, tell_origin, trained_in, width_in, world_of, write_scene_folder
@@ -20,9 +20,7 @@ from scene_experts.files.standard import NOTE_FORMAT, ExportTask, Made, Written,
 from scene_experts.render import Rasterizer
 from scene_experts.training.run_folder import OpenRun
 
-DRAWN_OPTIONS = ("measure", "crop", "cells")  # of formats that hold what pictures show
 OF_THE_PRECISION = "its values are rounded too coarsely: ask for a smaller --quality or a larger --target-mb"
-FITTED = ("quality", "target_mb")  # options of formats that choose a precision
 NAME = "scene"  # of files whose name the caller does not choose
 
 
@@ -80,7 +78,7 @@ def export_several(
     out: with several formats, a folder. The other arguments, the result and the errors are those of
     `export`.
     """
-    _check(options)
+    check_values(options)
     formats, notes = _formats_for(run, formats)
     _expect_for_file(run, formats, out, options)
     if len(formats) > 1 and out is not None:
@@ -88,7 +86,7 @@ def export_several(
             raise InputError(f"expected a folder as --out for several formats, found {out}; name a folder")
         out.mkdir(parents=True, exist_ok=True)
     works = [ExportTask(run, name, format_named(name), options, rasterize, tell, command) for name in dict.fromkeys(formats)]
-    _expect_fitted(works, options)
+    expect_fitted([(work.name, work.format) for work in works], options)
     if options.photographs and not any(work.format.look for work in works):
         raise InputError(f"expected --photographs with --format html of a scene with networks, found {works[0].name}; leave it out")
     standard, places = [], []
@@ -117,16 +115,6 @@ def export_several(
     if notes:
         written[-1] = replace(written[-1], lines=(*written[-1].lines, *notes))
     return written
-
-
-def _expect_fitted(works: Sequence[ExportTask], options: Options) -> None:
-    """Raises InputError for a precision that none of the formats has."""
-    unused = [name for name in FITTED if getattr(options, name) != getattr(DEFAULT, name)]
-    if unused and works and not any(work.format.fit for work in works):
-        instead = "; --max-gaussians, --prune and --sh-degree make this file smaller" if works[0].format.family == GAUSSIANS else ""
-        raise InputError(
-            f"expected {_flag(unused[0])} with --format compact or html, found --format {works[0].name}; leave it out{instead}"
-        )
 
 
 def _formats_for(run: OpenRun, formats: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -210,47 +198,6 @@ def _expect_for_file(run: OpenRun, formats: Sequence[str], out: Path | None, opt
         raise InputError("expected photographs' cameras for --floaters remove, found a scene without any; give its capture with --data")
 
 
-def _check(options: Options) -> None:
-    """Raises InputError, naming the flag, for values out of range."""
-    for name in ("sh_degree", "max_gaussians", "refine"):
-        if (getattr(options, name) or 0) < 0:
-            raise InputError(f"expected {_flag(name)} of at least 0, found {getattr(options, name)}; give a larger number")
-    if options.sh_degree > MAX_DEGREE:
-        raise InputError(f"expected --sh-degree of at most {MAX_DEGREE}, found {options.sh_degree}; give a lower degree")
-    if options.crop:
-        from scene_experts.files.select import parse_crop
-
-        parse_crop(options.crop)
-    if not 0 < options.quality < math.inf:
-        raise InputError(f"expected --quality above 0 dB, found {options.quality}; 0.2 is usual")
-    if not 0 <= options.target_mb < math.inf:
-        raise InputError(f"expected --target-mb as megabytes above 0, found {options.target_mb}; correct it")
-    if options.target_mb and options.quality != DEFAULT.quality:
-        raise InputError("expected --quality or --target-mb, found both; leave one out")
-    if not 0 <= options.prune < 1:
-        raise InputError(f"expected --prune as a share from 0 to below 1, found {options.prune}; correct it")
-
-
-def _expect_unused(options: Options, format: str) -> None:
-    """Raises InputError for options of standard files with a format that is none, and for those of
-    formats with a precision with another one."""
-    for f in fields(options):
-        if f.name == "measure" or getattr(options, f.name) == f.default or (f.name == "title" and format_named(format).view_note):
-            continue
-        if f.name == "photographs" and format_named(format).look is not None:
-            continue
-        if f.name in FITTED:
-            if format_named(format).fit is None:
-                raise InputError(f"expected {_flag(f.name)} with --format compact or html, found --format {format}; leave it out")
-        else:
-            which = "a standard file (ply, spz, baked-html, ...)"
-            raise InputError(f"expected {_flag(f.name)} with {which}, found --format {format}; leave it out")
-
-
-def _flag(name: str) -> str:
-    return "--" + name.replace("_", "-")
-
-
 def _export_scene(work: ExportTask, out: Path | None) -> Written:
     """Write the run's scene as it is, in a format of its own family."""
     run, format, traits = work.run, work.format, work.run.scene.traits
@@ -261,7 +208,7 @@ def _export_scene(work: ExportTask, out: Path | None) -> Written:
             f"expected a scene of {format.family} for --format {work.name}, found {traits.rows} (a run of '{run.config.train.recipe}'); "
             f"use --format {next(iter(own), 'ply')}"
         )
-    _expect_unused(work.options, work.name)
+    expect_unused(work.options, work.name)
     trained = world_of(run)
     if format.is_folder:
         return _export_folder(work, family, trained, out or run.path)
@@ -289,9 +236,7 @@ def _export_drawn(work: ExportTask, out: Path | None) -> Written:
     """Write what the pictures of a run show."""
     run, format = work.run, work.format
     assert format.draw is not None and format.write is not None
-    for f in fields(work.options):
-        if f.name not in DRAWN_OPTIONS and getattr(work.options, f.name) != f.default:
-            raise InputError(f"expected {_flag(f.name)} with another format, found --format {work.name}; leave it out")
+    expect_drawn(work.options, work.name)
     path = place_of(run, work.name, format, out)
     check_writable(path)
     if format.needs is not None:
