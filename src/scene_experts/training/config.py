@@ -66,8 +66,8 @@ class Train:
     """Iteration after which the background is random; until then it is that of the capture.
     --iterations rescales it."""
     dense_views: CountOrNone = 0
-    """With at most this many training views, start from points that a plane sweep finds in them,
-    unless --init or --points says where to start."""
+    """With at most this many training views, and fewer than 26,000 points, start from points that a
+    plane sweep finds in them, unless --init or --points says where to start."""
     mean_background: bool = False
     """Put the mean colour of the training photographs behind what none of them shows, unless
     --background names a colour or the photographs are transparent or masked."""

@@ -27,7 +27,7 @@ def test_a_dense_start_is_told_and_resumed_bit_for_bit(recipe, tmp_path):
 
 
 @pytest.mark.skipif(native.load() is None, reason="no compiled library")
-def test_a_recipe_starts_densely_with_few_views_and_says_so(tmp_path):
+def test_a_recipe_starts_densely_with_few_views_and_few_points_and_says_so(tmp_path, monkeypatch):
     cfg, folder = config("scaffold-gs", dense_views=7), make_planes(tmp_path / "planes", plane(4.0))
     asked, few = (next(events(c, folder, stop_at=1, init=init)) for c, init in ((cfg, "dense"), (cfg, "auto")))
     told = [re.sub(r"\(.* s CPU\)", "", begun.start) for begun in (asked, few)]
@@ -35,6 +35,10 @@ def test_a_recipe_starts_densely_with_few_views_and_says_so(tmp_path):
     plain = next(events(cfg, folder, stop_at=1, init="points"))
     many = next(events(replace(cfg, dense_views=6), folder, stop_at=1, init="auto"))
     assert plain.start == many.start == "" and plain.anchors == many.anchors
+    monkeypatch.setattr("scene_experts.training.start.ENOUGH", 1)
+    own = next(events(cfg, folder, stop_at=1, init="auto"))
+    assert own.start == "" and own.anchors == plain.anchors
+    monkeypatch.undo()
     flat = make_planes(tmp_path / "grey", hole(3.0, 50.0, 4.0))
     without = next(events(cfg, flat, stop_at=1, init="auto"))
     assert "finds no denser ones: it needs photographs that show depth and found it in 0.0 % of their pixels" in without.start
