@@ -12,7 +12,6 @@ from scene_experts.data.settings import Data
 from scene_experts.training.config import Train
 from scene_experts.training.state import Training
 
-
 ENOUGH = 26_000
 """Points of a capture with which a recipe does not start densely: twice what the sweep brings. With
 13,633 (fox) it gains, with 74,177 (bonsai) it loses detail (results/default.md)."""
