@@ -50,6 +50,7 @@ def draw(rows: list[dict[str, Any]], place: Path) -> None:
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
+    from matplotlib.ticker import LogLocator, StrMethodFormatter
 
     captures = sorted({row["capture"] for row in rows})
     figure, axes = pyplot.subplots(2, len(captures), figsize=(4 * len(captures), 6), squeeze=False, sharex="col")
@@ -60,6 +61,9 @@ def draw(rows: list[dict[str, Any]], place: Path) -> None:
             for axis, score in zip(axes[:, column], ("psnr", "lpips")):
                 axis.plot([row["bytes"] / 1e6 for row in line], [row[score] for row in line], "o-", markersize=3, linewidth=1, label=label)
         axes[0, column].set(title=capture, xscale="log", ylabel="PSNR, dB" if column == 0 else "")
+        axes[1, column].xaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
+        axes[1, column].xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes[1, column].xaxis.set_minor_formatter("")
         axes[1, column].set(xlabel="MB, all told", ylabel="LPIPS (VGG)" if column == 0 else "")
     axes[0, 0].legend(fontsize=7)
     figure.tight_layout()
