@@ -66,6 +66,7 @@ def interrupt(*_: object) -> None:
 
 def summarise(note: dict[str, Any]) -> list[str]:
     """Lines about the result, with advice if few photographs have a pose."""
+    from scene_experts.sfm.drift import DRIFT, KEY
     from scene_experts.training.progress import format_duration
 
     have, all_, without = note["with_pose"], note["photographs"], note["without_pose"]
@@ -73,6 +74,8 @@ def summarise(note: dict[str, Any]) -> list[str]:
         f"{have} of {all_} photographs have a pose: {note['points']:,} points, {note['observations']:.0f} points per photograph, "
         f"mean error {note['error']:.2f} px, {note['mapper']} mapper, {format_duration(note['seconds'])} min"
     ]
+    if (drift := note.get(KEY) or 0) >= DRIFT:
+        lines.append(f"the exposure of the photographs differs by {drift:.2f} stops (standard deviation): `--exposure` learns it")
     tried = note.get("mappers", {})
     if len(tried) > 1:
         posed = " and ".join(f"{count} from the {name} mapper" for name, count in tried.items())

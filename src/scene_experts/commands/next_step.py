@@ -17,10 +17,12 @@ def propose_training(data: Data, width: int, height: int, views: int) -> str:
     from scene_experts.api.command_line import changes, words_of
     from scene_experts.bench.advice import suggest
     from scene_experts.data.fetch.catalog import defaults_of
+    from scene_experts.sfm.drift import drifts
     from scene_experts.training.recipes import PROPOSED
 
     plain = Data(data.path, resolution=data.resolution, normalise=defaults_of(data.path).normalise)
     read = [word for place, value in changes(plain, data) or [] for word in words_of(place, value)]
+    read += ["--exposure"] if drifts(data.path) else []
     advice = suggest(width, height, views)
     time = f"  # {advice}" if str(advice) else ""
     return f"next: {shlex.join([PROG, 'train', PROPOSED, '--data', str(data.path), '--out', 'RUN', *read, *advice.flags])}{time}"

@@ -21,6 +21,7 @@ from scene_experts.data.readers import is_capture
 from scene_experts.files.export import export_several
 from scene_experts.files.options import Options
 from scene_experts.making.budget import LOOK, PAGE_GUESS, TimeBudget, Whole, find_slowness, plan_training
+from scene_experts.sfm.drift import drifts
 from scene_experts.sfm.options import SfmOptions
 from scene_experts.sfm.reconstruct import reconstruct
 from scene_experts.training import run_folder
@@ -142,7 +143,8 @@ class TrainingPlan:
         advice = plan_training(*self.size, views, have, slow)
         resolution = f"longest:{advice.side}" if advice.side else "auto"
         capture = load_capture(self.place, split=self.split, resolution=resolution)
-        return replace(self, capture=capture, recipe=recipe(PROPOSED, iterations=advice.iterations), minutes=advice.minutes)
+        chosen = recipe(PROPOSED, iterations=advice.iterations, exposure=self.recipe.exposure)
+        return replace(self, capture=capture, recipe=chosen, minutes=advice.minutes)
 
 
 def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Callable[[str], None]) -> TrainingPlan:
@@ -164,11 +166,12 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
         return TrainingPlan(place, split, (0, 0), capture, begun.train, begun=True)
     whole = load_capture(place, split=split)
     lens = whole.cameras[0]
-    first = TrainingPlan(place, split, (lens.width, lens.height), whole, recipe(PROPOSED))
+    first = TrainingPlan(place, split, (lens.width, lens.height), whole, recipe(PROPOSED, exposure=drifts(place)))
     plan = first.fit(budget.for_training(scores))
     held = f", {len(whole.test_cameras)} held out" if scores else ""
     about = "" if plan.minutes is None else f", about {max(1, round(plan.minutes))} min if the machine is not busy"
-    what = f"{plan.recipe.iterations:,} iterations, {plan.capture.data.resolution}, {len(whole.train_cameras)} photographs"
+    learned = ", their exposures" if plan.recipe.exposure else ""
+    what = f"{plan.recipe.iterations:,} iterations, {plan.capture.data.resolution}, {len(whole.train_cameras)} photographs{learned}"
     say(f"training: {plan.recipe.recipe}, {what}{held}{about}")
     return plan
 

@@ -26,6 +26,7 @@ from scene_experts.data.match import EXTENSIONS
 from scene_experts.data.readers import is_capture
 from scene_experts.native import library as native
 from scene_experts.sfm import frames, photos, work, worker
+from scene_experts.sfm.drift import KEY, NOTE, measure_drift
 from scene_experts.sfm.learned import attempt
 from scene_experts.sfm.learned.photographs import Shots
 from scene_experts.sfm.masks import write_masks
@@ -34,7 +35,7 @@ from scene_experts.sfm.pairs import choose_pairs, find_alike
 from scene_experts.sfm.panoramas import cuts, find_place, take_photos
 from scene_experts.sfm.photos import Photo
 
-LOG, NOTE, VIDEO, FRAMES = "colmap.log", "capture.json", "video.txt", "frames"
+LOG, VIDEO, FRAMES = "colmap.log", "video.txt", "frames"
 LEARNED = "database/learned"  # features and matches of networks, removed with the database
 
 Say = Callable[[str], None]
@@ -128,6 +129,8 @@ def reconstruct(
         if warning := warn_of_mapper(result, options):
             say(warning)
         note = describe_result(result, found, options, time.monotonic() - began, copied=not own, exhaustive=len(pairs) == every)
+        drift = measure_drift(Path(request["model"]), images)
+        note |= {KEY: None if drift is None else round(drift, 3)}
         write_json(folder / work.DONE / NOTE, note)
         work.publish(out)
     shutil.rmtree(out / work.NAME, ignore_errors=True)
