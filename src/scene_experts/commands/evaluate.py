@@ -54,6 +54,8 @@ def evaluate(args: list[str]) -> int:
     if not group.first:
         return 0
     print_results(results, Console(markup=False, highlight=False), command.run)
+    if (aligned := results.get("psnr_aligned")) is not None and aligned - results["psnr"] >= DRIFTS:
+        print(f"PSNR {aligned:.2f} dB with the colours of each picture aligned with its photograph: exposures differ (train --exposure)")
     if not command.options.suffix:  # the page shows the held-out views, and all photographs
         for line in describe_outliers(read_photographs(command.run)):
             print(f"warning: {line}")
@@ -64,6 +66,10 @@ def evaluate(args: list[str]) -> int:
         print(f"next: {shlex.join(words)}  # or --format ply")
         print(f"next: {shlex.join([PROG, 'render', str(command.run), '--out', str(command.run / 'flight.mp4')])}")
     return 0
+
+
+DRIFTS = 1.0
+"""dB that the alignment of colours gains where `eval` tells it."""
 
 
 @dataclass(frozen=True)

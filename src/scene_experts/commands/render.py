@@ -27,7 +27,7 @@ class RenderCommand:
     out: Path | None = None
     """Video to write (.mp4, .mov, .mkv or .webm), or a folder for PNG files, with --show depth also
     for TIFF files of depths (float32, the capture's unit); by default RUN/renders/NAME.mp4 with the
-    path's name."""
+    path's name and what is shown."""
     options: Annotated[FilmOptions, Option(name="")] = FilmOptions()
     beside: Annotated[tuple[Path, ...], Option(value="RUN")] = ()
     """Other runs of the same capture to show side by side."""
@@ -69,7 +69,8 @@ def render(args: list[str]) -> int:
             print(f"warning: {text} and may show fog; {nearer} stays near the photographs", file=sys.stderr)
         if command.save_path:
             film.write_path(command.save_path)
-        out = command.out or command.run / "renders" / f"{Path(command.options.path).stem}.mp4"
+        shown = "" if command.options.show == ("picture",) else "_" + "_".join(command.options.show)
+        out = command.out or command.run / "renders" / f"{Path(command.options.path).stem}{shown}.mp4"
         with ProgressBar(Console(stderr=True, markup=False)) as tell:
             count = film.write(out, rasterize, device, tell)
     finally:

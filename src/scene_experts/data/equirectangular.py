@@ -16,9 +16,10 @@ from torch import Tensor
 from torch.nn import functional
 
 FIELD = 90.0  # degrees, of a view
-SEAM, POLE = 2.2, 0.6
+SEAM, POLE, EDGE = 2.2, 0.6, 0.3
 """What a panorama without XMP data shows: its left and right edges differ at most this many times as
-much as neighbouring columns do, and its top and bottom rows vary at most this share of its middle."""
+much as neighbouring columns do, its top and bottom rows vary at most this share of its middle, and
+its edges vary at least this share of what its columns do: plain edges meet without being one."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,9 @@ def is_seamless(picture: np.ndarray) -> bool:
     seam = np.abs(values[:, 0] - values[:, -1]).mean()
     beside = np.abs(np.diff(values, axis=1)).mean()
     poles = max(values[row].std(axis=0).mean() for row in (0, -1))
-    return bool(seam <= SEAM * max(beside, 1.0) and poles <= POLE * max(values[len(values) // 2].std(axis=0).mean(), 4.0))
+    columns = values.std(axis=0).mean(1)
+    plain = min(columns[0], columns[-1]) < EDGE * max(float(np.median(columns)), 4.0)
+    return bool(not plain and seam <= SEAM * max(beside, 1.0) and poles <= POLE * max(values[len(values) // 2].std(axis=0).mean(), 4.0))
 
 
 def mask_nadir(view: PanoramaView, side: int, nadir: float) -> np.ndarray:

@@ -27,6 +27,7 @@ RANDOM_POINTS = 10_000  # as 3DGS for NeRF-synthetic scenes
 FEW = 12  # with fewer views, all are trained on unless the user holds some out
 NORMAL_EXTENT = 5.0  # extent of a capture in a normalised world
 _FAR_VIEW = 50.0  # a camera further from the median camera than this many median distances is mislocated
+_ONE_PLACE = 1e-9  # of the median distance from the origin: views nearer to each other are of one place
 _FAR_POINT = (50.0, 20.0)  # a point further from the cameras than both 50 extents and 20 median distances is noise
 
 
@@ -190,12 +191,16 @@ def drop_outlier_views(capture: Capture) -> Capture:
     """Drop the views whose camera is more than 50 median distances from the median camera. Such
     poses are errors and distort the extent.
 
-    A capture of fewer than 8 views is not changed.
+    Views of one place, such as those of a panorama, count as one. A capture of fewer than 8 places
+    is not changed.
     """
     xyz = camera_centres(capture.views)
-    distance = (xyz - xyz.median(0).values).norm(dim=1)
-    bad = distance > _FAR_VIEW * distance.median()
-    if len(xyz) < 8 or not bool(bad.any()) or float(distance.median()) == 0.0:
+    step = _ONE_PLACE * float(xyz.norm(dim=1).median())
+    places = torch.unique((xyz / step).round(), dim=0) * step if step else xyz
+    middle = places.median(0).values
+    usual, distance = float((places - middle).norm(dim=1).median()), (xyz - middle).norm(dim=1)
+    bad = distance > _FAR_VIEW * usual
+    if len(places) < 8 or not bool(bad.any()) or usual == 0:
         return capture
     first = capture.views[int(bad.nonzero()[0])].name
     note = f"dropped {int(bad.sum())} views whose camera is over {_FAR_VIEW:.0f} times further away than most (first: {first})"

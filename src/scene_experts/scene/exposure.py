@@ -28,7 +28,8 @@ from scene_experts.core.types import Camera
 GAMMA = 2.2
 GROUP = "exposure"  # name of the learning rate, and of the tensors in a checkpoint
 RATE = Rate(0.01, 0.0001)  # stops, from the start of the training to the end
-RISE = 100  # iterations in which the rate rises linearly to it
+SHORT, MOST = 3000, 5.0  # iterations; below, the rate is sqrt(SHORT / iterations) times as large, at most MOST times
+RISE = 100  # iterations in which the rate rises linearly to it; a thirtieth of a short training
 NEAREST = 1e-3  # of d: cameras nearer to a training camera have its gains
 
 
@@ -114,7 +115,8 @@ class Exposures(nn.Module):
 
     def learning_rate(self, step: int, total: int) -> float:
         """Return the learning rate at `step` of `total`."""
-        return RATE.at(step, total) * min(1.0, step / RISE)
+        faster = min(MOST, max(1.0, SHORT / total) ** 0.5)
+        return RATE.at(step, total) * faster * min(1.0, step / min(RISE, max(1.0, total / 30)))
 
 
 class _Bounded(torch.autograd.Function):

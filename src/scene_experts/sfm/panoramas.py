@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from scene_experts.core.errors import few
 from scene_experts.core.io import read_json, write_atomic, write_json
 from scene_experts.core.reading.budget import CAPTURED
 from scene_experts.core.reading.pictures import opening_picture
@@ -63,6 +64,11 @@ def take_photos(
     if not cuts(found, options):
         if turned:
             say(flat)
+        if options.nadir:
+            say(f"warning: --nadir {options.nadir:g} has no effect, because no panorama is cut into views")
+        wide = [photo.name for photo in found if photo.size[0] == 2 * photo.size[1] and not photo.round]
+        if wide:
+            say(f"{len(wide)} photographs of 2:1 are taken as perspective pictures, because their edges do not meet ({few(wide)})")
         return copy_photos(found, source, images), None
     plain = [photo for photo in found if not photo.round]
     copied = copy_photos(plain, source, images, FOLDERS) if plain else []

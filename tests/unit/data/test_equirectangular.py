@@ -59,6 +59,9 @@ def test_values_are_exact_at_pixels_and_go_on_around_the_seam():
 def test_panoramas_are_told_from_photographs_of_their_shape():
     panorama = draw_panorama(paint_walls(64), (0.2, 0, 0.4), 0.3, 256)
     assert is_seamless(panorama)
+    product = np.full((128, 256, 3), 250, np.uint8)
+    product[40:90, 80:180] = panorama[40:90, 80:180]
+    assert not is_seamless(product)
     assert not is_seamless(panorama[64:96, 32:96]) and not is_seamless(np.roll(panorama, 64, 0))
 
 

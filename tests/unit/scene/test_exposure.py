@@ -99,3 +99,9 @@ def test_they_come_back_from_a_checkpoint(exposures):
     for camera in (camera_at(9, 0.0), camera_at(7, 0.3)):
         assert torch.equal(made.stops_of(camera), exposures.stops_of(camera))
     assert Exposures.restore({}) is None
+
+
+def test_short_trainings_learn_faster(exposures):
+    assert exposures.learning_rate(3000, 3000) == pytest.approx(1e-4) and exposures.learning_rate(50, 3000) < 0.006
+    assert exposures.learning_rate(10, 300) == pytest.approx(0.01 * 10**0.5 * 0.01 ** (10 / 300), rel=0.05)
+    assert exposures.learning_rate(30_000, 30_000) == pytest.approx(1e-4)
