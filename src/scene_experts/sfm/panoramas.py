@@ -86,6 +86,13 @@ def find_place(name: str) -> str:
     return rest if folder in FOLDERS else name
 
 
+def choose_held_out(names: Sequence[str]) -> list[str]:
+    """Return the views that are held out: those of every 8th panorama. The views of one place show
+    the same, so that one alone would be no test."""
+    places = sorted({find_place(name) for name in names if find_place(name) != name}, key=natural_key)
+    return [name for name in names if find_place(name) != name and find_place(name) in places[::8]]
+
+
 def cut_panoramas(photos: Sequence[Photo], source: Path, target: Path, nadir: float = 0.0) -> tuple[list[Photo], PanoramaRig]:
     """Cut the views out of panoramas in the folder `source`, into FOLDER/NAME.jpg in `target`, and
     return them with their masks. Views of an earlier call from the same files are kept; other files

@@ -32,10 +32,11 @@ from scene_experts.sfm.learned.photographs import Shots
 from scene_experts.sfm.masks import write_masks
 from scene_experts.sfm.options import SfmOptions
 from scene_experts.sfm.pairs import choose_pairs, find_alike
-from scene_experts.sfm.panoramas import cuts, find_place, take_photos
+from scene_experts.sfm.panoramas import choose_held_out, cuts, find_place, take_photos
 from scene_experts.sfm.photos import Photo
 
 LOG, VIDEO, FRAMES = "colmap.log", "video.txt", "frames"
+TEST = "test.txt"  # lists the views that a training holds out
 LEARNED = "database/learned"  # features and matches of networks, removed with the database
 
 Say = Callable[[str], None]
@@ -129,6 +130,8 @@ def reconstruct(
         if warning := warn_of_mapper(result, options):
             say(warning)
         note = describe_result(result, found, options, time.monotonic() - began, copied=not own, exhaustive=len(pairs) == every)
+        if rig is not None:
+            write_bytes(Path(request["model"]) / TEST, "\n".join(choose_held_out(result["registered"])).encode())
         drift = measure_drift(Path(request["model"]), images)
         note |= {KEY: None if drift is None else round(drift, 3)}
         write_json(folder / work.DONE / NOTE, note)

@@ -9,7 +9,7 @@ from PIL import Image
 from scene_experts.data.equirectangular import VIEWS
 from scene_experts.sfm import reconstruct as run
 from scene_experts.sfm.options import SfmOptions
-from scene_experts.sfm.panoramas import PanoramaRig, cut_panoramas, find_place
+from scene_experts.sfm.panoramas import PanoramaRig, choose_held_out, cut_panoramas, find_place
 from scene_experts.sfm.photos import find_photos
 from support.captures import load
 from support.rooms import draw_panorama, paint_walls
@@ -63,6 +63,12 @@ def test_other_photographs_are_their_own_place():
     assert find_place("a/b.jpg") == "a/b.jpg" and find_place("yaw045_pitch+00/a/b.jpg") == "a/b.jpg"
 
 
+def test_whole_panoramas_are_held_out():
+    names = [f"{view.folder}/{i}.jpg" for view in VIEWS for i in range(10)] + ["0.jpg", "8.jpg"]
+    held = choose_held_out(names)
+    assert len(held) == 2 * len(VIEWS) and {find_place(name) for name in held} == {"0.jpg", "8.jpg"} and "0.jpg" not in held
+
+
 def test_the_worker_is_told_each_turn():
     told = PanoramaRig(40).plain()
     assert len(told["views"]) == 12 and np.allclose(told["views"]["yaw045_pitch+00"], VIEWS[0].rig_from_view.T)
@@ -81,8 +87,10 @@ def test_poses_of_panoramas_are_those_they_were_drawn_from(tmp_path):
     said = []
     note = run.reconstruct(source, tmp_path / "capture", SfmOptions(threads=2), say=said.append)
     assert note["with_pose"] == 48 and "4 of 4 photographs are 360 degree panoramas" in said[0]
+    capture = load(tmp_path / "capture")
+    assert {find_place(capture.views[i].name) for i in capture.test} == {"0.jpg"} and len(capture.test) == 12
     found: dict[str, list] = {}
-    for view in load(tmp_path / "capture").views:
+    for view in capture.views:
         found.setdefault(find_place(view.name), []).append(view.camera.position.numpy())
     assert max(np.ptp(np.array(group), axis=0).max() for group in found.values()) < 1e-4  # one place each
     centres = np.array([np.mean(found[f"{i}.jpg"], axis=0) for i in range(4)])
