@@ -18,6 +18,8 @@ from scene_experts.core.reading.source import sentence
 
 SLOW = ("make", "capture", "train", "eval", "render", "view", "export", "import")
 """Commands that load torch before their first line."""
+CONTINUED = ("make", "capture", "download")
+"""Commands that go on where they were interrupted."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -78,7 +80,7 @@ def dispatch(args: list[str]) -> int:
         print(f"error: expected enough memory, found too little ({why}); {advice}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("stopped", file=sys.stderr)
+        print("stopped" + ("; the same command goes on from there" if command in CONTINUED else ""), file=sys.stderr)
         return 130
 
 

@@ -31,6 +31,15 @@ def test_exit_codes(error, code, said, monkeypatch, capsys):
     assert out == "" and said in err and err.count("\n") == 1
 
 
+def test_a_command_that_goes_on_says_so_when_it_is_stopped(monkeypatch, capsys):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands, "run", stop)
+    assert cli.main(["capture", "photos"]) == 130
+    assert capsys.readouterr().err == "stopped; the same command goes on from there\n"
+
+
 def test_neither_is_the_other_and_a_fault_of_ours_is_not_hidden(monkeypatch):
     assert not issubclass(InputError, RunError) and not issubclass(RunError, InputError)
 
