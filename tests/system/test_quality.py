@@ -53,7 +53,7 @@ def held_out(captures):
         cfg = replace(RECIPES[recipe][1], iterations=steps, seed=seed)
         cfg = replace(cfg, growth=replace(cfg.growth, enabled=grow))
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("scene_experts.training.loop.Training", Kept)
+            patch.setattr("scene_experts.training.start.Training", Kept)
             for _ in train(cfg, Job(RunConfig(cfg, Data(capture.root))), capture, draw):
                 pass
         return last["scene"]
