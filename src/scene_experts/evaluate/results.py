@@ -17,6 +17,7 @@ from scene_experts.core.fields import flag_of
 from scene_experts.core.io import read_json
 from scene_experts.core.types import Camera
 from scene_experts.data.views import same_poses
+from scene_experts.evaluate.alignment import PROTOCOL
 from scene_experts.evaluate.experts import measure_scene_shares
 from scene_experts.evaluate.metrics import VARIANTS, Perceptual
 from scene_experts.evaluate.options import EvalOptions
@@ -111,14 +112,16 @@ def describe_scene(scene: Scene, step: int) -> dict[str, Any]:
     }
 
 
-def describe_views(capture: Capture, cameras: Sequence[Camera], options: EvalOptions) -> dict[str, Any]:
-    """Return which views were scored, and the choices that make scores comparable."""
+def describe_views(capture: Capture, cameras: Sequence[Camera], options: EvalOptions, aligned: bool = False) -> dict[str, Any]:
+    """Return which views were scored, and the choices that make scores comparable. aligned: the
+    cameras were first aligned with the scene."""
     return {
         "capture": capture.name,
         "views": options.views,
         **({"appearance": "half"} if options.appearance == "half" else {}),
         "view_count": len(cameras),
         "split": capture.split,
+        **({"alignment": PROTOCOL} if aligned else {}),
         **({"left_out": list(capture.omitted)} if capture.omitted else {}),
         "resolution": capture.resolution,
         "mean_pixels": round(sum(c.width * c.height for c in cameras) / len(cameras)),
