@@ -4,7 +4,7 @@ The scene of such a run belongs to its refined cameras, and nobody has refined t
 Each is moved, from the pose of the capture, to where its photograph fits the scene best: STEPS
 steps of Adam on the six numbers of its pose alone, by the L1 error. The score of a held-out view is
 then that of its picture at this pose, which has seen its photograph. Compare it only with scores
-that were aligned too.
+that were aligned too (`eval --align-poses` for a run without refined poses).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from scene_experts.scene import Draws
 from scene_experts.scene.poses import at_pose, attach
 
 STEPS, RATE = 80, 1e-3  # steps and learning rate of Adam (rad and extents); the rate falls linearly to 0
-PROTOCOL = f"held-out cameras aligned with the frozen scene by their photographs, {STEPS} steps of Adam"
+ALIGNED = f"held-out cameras aligned with the frozen scene by their photographs, {STEPS} steps of Adam"
 
 
 def align(

@@ -17,7 +17,7 @@ from scene_experts.core.fields import flag_of
 from scene_experts.core.io import read_json
 from scene_experts.core.types import Camera
 from scene_experts.data.views import same_poses
-from scene_experts.evaluate.alignment import PROTOCOL
+from scene_experts.evaluate.alignment import ALIGNED
 from scene_experts.evaluate.experts import measure_scene_shares
 from scene_experts.evaluate.metrics import VARIANTS, Perceptual
 from scene_experts.evaluate.options import EvalOptions
@@ -38,10 +38,11 @@ PROTOCOL = {  # what must agree before scores may be compared: key in results.js
     "view_count": ("number of views", "max_views"),
     "mean_pixels": ("picture size", "resolution"),  # after the views: those of another split may have other sizes
     "appearance": ("appearance codes", "appearance"),
+    "alignment": ("alignment of held-out cameras", "align_poses"),
     "masked": ("use of masks", "data"),
     "background": ("background of transparent photographs", "background"),
 }
-DEFAULTS = {"appearance": "rule", "left_out": []}  # the meaning of a results file without the key
+DEFAULTS = {"appearance": "rule", "left_out": [], "alignment": "none"}  # the meaning of a results file without the key
 MAY_LACK = ("background",)  # a results file without one of these agrees with every other
 
 
@@ -121,7 +122,7 @@ def describe_views(capture: Capture, cameras: Sequence[Camera], options: EvalOpt
         **({"appearance": "half"} if options.appearance == "half" else {}),
         "view_count": len(cameras),
         "split": capture.split,
-        **({"alignment": PROTOCOL} if aligned else {}),
+        **({"alignment": ALIGNED} if aligned else {}),
         **({"left_out": list(capture.omitted)} if capture.omitted else {}),
         "resolution": capture.resolution,
         "mean_pixels": round(sum(c.width * c.height for c in cameras) / len(cameras)),

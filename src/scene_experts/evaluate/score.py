@@ -95,7 +95,7 @@ def evaluate(
     with fitted, pictures.replacing(out / options.folder, group.first) as folder, pictures.Writer() as writer:
         group.wait()
         drawing = Drawing(scene.frozen(step), rasterize, step, background, options.appearance == "half", scene.as_photographed)
-        aligns = scene.poses is not None and options.views == "test"
+        aligns = options.views == "test" and (options.align_poses or scene.poses is not None)
 
         def score_mine() -> dict[int, dict[str, Any]]:
             found = {}
@@ -150,6 +150,8 @@ def choose_views(capture: Capture, options: EvalOptions) -> tuple[int, ...]:
         raise InputError(f"expected at least one {views} view in {capture.name}, found none (split {capture.split}); {NO_VIEWS[views]}")
     if options.appearance == "half" and views == "train":
         raise InputError("training views already have appearance codes: use --appearance half without --views train")
+    if options.align_poses and views == "train":
+        raise InputError("expected held-out views for --align-poses, found training views, which keep their poses; leave --align-poses out")
     return chosen
 
 

@@ -36,8 +36,8 @@ from scene_experts.data.fetch.obtain import resolve
 from scene_experts.data.settings import Data
 from scene_experts.scene import Scene
 from scene_experts.scene.exposure import Exposures
-from scene_experts.scene.poses import Poses
 from scene_experts.scene.fit import restore_foreign
+from scene_experts.scene.poses import Poses
 from scene_experts.training import capture_place
 from scene_experts.training.capture_place import Lone
 from scene_experts.training.clock import Clock

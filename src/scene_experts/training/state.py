@@ -21,11 +21,10 @@ from scene_experts.core.reading.budget import RUN
 from scene_experts.core.reading.source import guarding
 from scene_experts.data.capture import Capture
 from scene_experts.data.settings import Data
-from scene_experts.scene import Scene, SceneConfig, restore_scene
-from scene_experts.scene import exposure, poses
+from scene_experts.scene import Scene, SceneConfig, exposure, poses, restore_scene
 from scene_experts.scene.exposure import Exposures
-from scene_experts.scene.poses import Poses
 from scene_experts.scene.fit import restore_foreign
+from scene_experts.scene.poses import Poses
 from scene_experts.training.average import Averages
 from scene_experts.training.clock import Clock
 from scene_experts.training.config import RunConfig, Train
