@@ -227,6 +227,7 @@ class Run:
         lpips: bool = True,
         lpips_weights: str | Path | None = None,
         download_lpips: bool = False,
+        align_poses: bool = False,
     ) -> Scores:
         """Render the held-out views and score them as 8-bit pictures, as `scene-experts eval` does.
 
@@ -241,12 +242,14 @@ class Run:
             lpips_weights: Folder or file with these weights. Default: where `scene-experts eval`
                 looks for them.
             download_lpips: Download the weights if they are not on this machine.
+            align_poses: Move each held-out camera to where its photograph fits the scene best,
+                before it is scored. Always done for a run with refined poses.
 
         Raises:
             InputError: The split has no views, or `views` or `appearance` is unknown.
             RunError: The disk is full.
         """
-        options = EvalOptions(views, appearance, lpips, None if lpips_weights is None else Path(lpips_weights), download_lpips)
+        options = EvalOptions(views, appearance, lpips, None if lpips_weights is None else Path(lpips_weights), download_lpips, align_poses)
         with self._folder() as folder:
             details = evaluate(self.scene, self.capture.loaded, self._rasterize, folder, options, step=self.step, about=about(self._now()))
             if not options.suffix:  # the report lists all photographs

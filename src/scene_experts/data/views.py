@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -134,6 +135,7 @@ class Capture:
     applied: object = None  # rows of the 3x4 matrix that turned a reconstruction into the capture's own frame, unchecked
     random_points: bool = False  # its points are random
     omitted: tuple[str, ...] = ()  # names of the photographs that --leave-out leaves out; they have no views
+    posed: str = ""  # `poses` before `with_cameras`
     left_out: tuple[int, ...] = ()  # indices of training views that --views leaves out; they still identify the capture
 
     @property
@@ -164,13 +166,13 @@ class Capture:
 
     def poses(self) -> str:
         """Return the poses of up to four views, the first and the last among them, as text that
-        `same_poses` compares.
+        `same_poses` compares. They are those of the files, also after `with_cameras`.
 
         Each view has nine numbers: the centre of its camera in the capture's own frame and unit,
         its forward axis and its down axis.
         """
-        if not self.views:
-            return ""
+        if self.posed or not self.views:
+            return self.posed
         chosen = sorted({round(i * (len(self.views) - 1) / (SAMPLED - 1)) for i in range(SAMPLED)})
         out = []
         for camera in (self.views[i].camera for i in chosen):
@@ -179,6 +181,10 @@ class Capture:
             axes = torch.cat((pose[2, :3], pose[1, :3]))
             out.append(" ".join([*(f"{v:.9g}" for v in centre.tolist()), *(f"{v:.5g}" for v in axes.tolist())]))
         return "; ".join(out)
+
+    def with_cameras(self, change: Callable[[Camera], Camera]) -> Capture:
+        """Return the capture with other cameras: `change` of each of its own."""
+        return replace(self, views=tuple(replace(v, camera=change(v.camera)) for v in self.views), posed=self.poses())
 
     def expect_poses(self, poses: object, run: Path | None) -> None:
         """Raise InputError, and close the capture, if its cameras are not where they were (`poses`)

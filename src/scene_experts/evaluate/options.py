@@ -23,6 +23,9 @@ class EvalOptions:
     """File or folder of the LPIPS weights."""
     download_lpips: bool = False
     """Download the LPIPS weights if they are not on this machine."""
+    align_poses: bool = False
+    """Move each held-out camera to where its photograph fits the scene best, before it is scored.
+    Always done for a run of `train --refine-poses`, and stated in the results."""
 
     @property
     def folder(self) -> str:

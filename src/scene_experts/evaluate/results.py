@@ -17,6 +17,7 @@ from scene_experts.core.fields import flag_of
 from scene_experts.core.io import read_json
 from scene_experts.core.types import Camera
 from scene_experts.data.views import same_poses
+from scene_experts.evaluate.alignment import ALIGNED
 from scene_experts.evaluate.experts import measure_scene_shares
 from scene_experts.evaluate.metrics import VARIANTS, Perceptual
 from scene_experts.evaluate.options import EvalOptions
@@ -37,10 +38,11 @@ PROTOCOL = {  # what must agree before scores may be compared: key in results.js
     "view_count": ("number of views", "max_views"),
     "mean_pixels": ("picture size", "resolution"),  # after the views: those of another split may have other sizes
     "appearance": ("appearance codes", "appearance"),
+    "alignment": ("alignment of held-out cameras", "align_poses"),
     "masked": ("use of masks", "data"),
     "background": ("background of transparent photographs", "background"),
 }
-DEFAULTS = {"appearance": "rule", "left_out": []}  # the meaning of a results file without the key
+DEFAULTS = {"appearance": "rule", "left_out": [], "alignment": "none"}  # the meaning of a results file without the key
 MAY_LACK = ("background",)  # a results file without one of these agrees with every other
 
 
@@ -111,14 +113,16 @@ def describe_scene(scene: Scene, step: int) -> dict[str, Any]:
     }
 
 
-def describe_views(capture: Capture, cameras: Sequence[Camera], options: EvalOptions) -> dict[str, Any]:
-    """Return which views were scored, and the choices that make scores comparable."""
+def describe_views(capture: Capture, cameras: Sequence[Camera], options: EvalOptions, aligned: bool = False) -> dict[str, Any]:
+    """Return which views were scored, and the choices that make scores comparable. aligned: the
+    cameras were first aligned with the scene."""
     return {
         "capture": capture.name,
         "views": options.views,
         **({"appearance": "half"} if options.appearance == "half" else {}),
         "view_count": len(cameras),
         "split": capture.split,
+        **({"alignment": ALIGNED} if aligned else {}),
         **({"left_out": list(capture.omitted)} if capture.omitted else {}),
         "resolution": capture.resolution,
         "mean_pixels": round(sum(c.width * c.height for c in cameras) / len(cameras)),

@@ -30,6 +30,7 @@ from scene_experts.core.io import write_json
 from scene_experts.core.progress import Progress
 from scene_experts.core.types import Camera, Decoded, Mode, Render
 from scene_experts.evaluate import halves, pictures, results
+from scene_experts.evaluate.alignment import align
 from scene_experts.evaluate.experts import write_expert_strips
 from scene_experts.evaluate.metrics import Perceptual, score
 from scene_experts.evaluate.options import EvalOptions
@@ -94,6 +95,7 @@ def evaluate(
     with fitted, pictures.replacing(out / options.folder, group.first) as folder, pictures.Writer() as writer:
         group.wait()
         drawing = Drawing(scene.frozen(step), rasterize, step, background, options.appearance == "half", scene.as_photographed)
+        aligns = options.views == "test" and (options.align_poses or scene.poses is not None)
 
         def score_mine() -> dict[int, dict[str, Any]]:
             found = {}
@@ -101,6 +103,8 @@ def evaluate(
                 index = chosen[n]
                 capture.images.prefetch([chosen[later] for later in mine if later > n][:2])
                 name = capture.views[index].name
+                if aligns:
+                    cameras[n] = drawing.align(capture, index, cameras[n], scene.extent)
                 shown, facts = drawing.draw(capture, index, cameras[n])
                 scores = shown.score(perceptual, device)
                 writer.submit(partial(shown.write, folder, files[name], scores))
@@ -124,7 +128,7 @@ def evaluate(
             "gaussians_rendered": results.mean_over_views(per_view, "gaussians_rendered"),
             "activation_ratio": results.mean_over_views(per_view, "activation_ratio"),
             "fps": asdict(measure_speed(scene, cameras, step, rasterize, background)),
-            **results.describe_views(capture, cameras, options),
+            **results.describe_views(capture, cameras, options, aligns),
             **results.describe_run(about or About(), step, rasterize, perceptual),
             "evaluation_seconds": time.perf_counter() - began,
         }
@@ -146,6 +150,8 @@ def choose_views(capture: Capture, options: EvalOptions) -> tuple[int, ...]:
         raise InputError(f"expected at least one {views} view in {capture.name}, found none (split {capture.split}); {NO_VIEWS[views]}")
     if options.appearance == "half" and views == "train":
         raise InputError("training views already have appearance codes: use --appearance half without --views train")
+    if options.align_poses and views == "train":
+        raise InputError("expected held-out views for --align-poses, found training views, which keep their poses; leave --align-poses out")
     return chosen
 
 
@@ -199,6 +205,17 @@ class Drawing:
     background: Tensor  # [3]
     half: bool  # score only the right half of each view
     as_photographed: Callable[[Tensor, Camera], Tensor]
+
+    def align(self, capture: Capture, index: int, camera: Camera, extent: float) -> Camera:
+        """Return the camera of view `index` aligned with the scene by the photograph, by its left
+        half with `half`."""
+        frame, device = capture.frame(index), self.background.device
+        counts = frame.mask
+        if self.half:
+            left = halves.left_half(camera.height, camera.width)
+            counts = left if counts is None else left * counts.cpu()
+        photo = (frame.rgb.float() / 255).to(device)
+        return align(self.draws, self.rasterize, camera, photo, counts, self.step, self.background, extent, self.as_photographed)
 
     @torch.no_grad()
     def draw(self, capture: Capture, index: int, camera: Camera) -> tuple[Shown, dict[str, Any]]:

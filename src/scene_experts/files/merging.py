@@ -55,6 +55,8 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
             raise InputError(f"expected a scene of anchors in {path}, found one of {scene.traits.rows}; train an anchor recipe")
         if run.capture != fingerprint:
             raise InputError(f"expected a run on the capture of the plan, found one on another in {path}; use the plan's command")
+        if scene.poses is not None:
+            raise InputError(f"expected blocks on the poses of the capture, found refined ones in {path}; train it without --refine-poses")
         if not same_poses(poses, run.poses):
             raise InputError(f"expected runs on one capture, found other camera poses in {path} than in {runs[0]}; train it again")
         poses = poses or run.poses

@@ -29,6 +29,15 @@ def make_pose(position: Tensor, rotation: Tensor) -> Tensor:
     return out
 
 
+def exp_motion(motion: Tensor) -> Tensor:
+    """Return the rigid motion [4, 4] of a twist [6]: rotation vector (rad), then translation. With a
+    graph if the twist has one."""
+    x, y, z, *move = motion.unbind()
+    o = torch.zeros_like(x)
+    twist = torch.stack([o, -z, y, move[0], z, o, -x, move[1], -y, x, o, move[2], o, o, o, o]).view(4, 4)
+    return torch.linalg.matrix_exp(twist)
+
+
 def look_at(position: Tensor, target: Tensor, up: Tensor) -> Tensor:
     """Return the world-to-camera matrix [4, 4] of a camera at `position` that looks at `target`,
     with `up` upwards in its image."""

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from scene_experts.scene.anchors.appearance import Codes
     from scene_experts.scene.anchors.quantise import RowRounding
     from scene_experts.scene.exposure import Exposures
+    from scene_experts.scene.poses import Poses
 
 Cull = Callable[[Tensor, Tensor, Camera], Tensor]
 """The rasteriser's visibility test: means [n, 3], scales [n, 3], camera -> [n] bool."""
@@ -87,6 +88,7 @@ class Scene(nn.Module):
     dense_until: int = 0  # last iteration of the experts' dense warm-up; 0 without one
     codes: Codes | None  # appearance codes; None where `traits.appearance` is 0
     exposures: Exposures | None  # of the training photographs; None: all are taken to have one
+    poses: Poses | None  # refined with the scene; None: those of the capture
 
     def __init__(self, table: Table, extent: float) -> None:
         """extent: the extent R of the capture, in trained world units."""
@@ -94,6 +96,7 @@ class Scene(nn.Module):
         self.table, self.extent = table, extent
         self.codes = None
         self.exposures = None
+        self.poses = None
 
     @property
     @abstractmethod

@@ -74,6 +74,9 @@ class Train:
     exposure: bool = False
     """Learn the exposure and white balance of each training photograph. The scene is that of their
     mean; `eval` draws a held-out view at the exposure of the photographs near it."""
+    refine_poses: bool = False
+    """Learn small motions of the training cameras with the scene, for poses that are not exact.
+    `eval` first aligns each held-out camera with the trained scene."""
     max_anchors: CountOrNone = 0
     """Stop densification at this number of anchors; 0 leaves that of the growth rule (a million for
     3dgs-mcmc, otherwise none)."""

@@ -18,6 +18,7 @@ from scene_experts.core.lazy import LazyMapping
 from scene_experts.core.types import Camera, Decoded, Mode, Render
 from scene_experts.render import Rasterizer, draw_with_gradients, explain_indirect
 from scene_experts.scene import Cull, DirectScene, Scene
+from scene_experts.scene.poses import at_pose, pose_gradient
 from scene_experts.training.losses import Sample, Weights, compute_scene_terms, compute_terms
 from scene_experts.training.photometric import photometric_gradients
 
@@ -71,11 +72,17 @@ class DirectStep:
         Returns the decoded view, its picture and the terms of the loss.
         """
         w = self.weights
+        with torch.enable_grad():
+            pose = None if scene.poses is None else scene.poses.pose_of(camera)
+        camera = camera if pose is None else at_pose(camera, pose)
         decoded, backward_scene = self.prepare(scene, number).draw(camera, number, self.rasterize.visible)
         render, backward_picture = draw_with_gradients(self.rasterize, decoded.gaussians, camera, background)
         shown, go_back = (render.image, None) if scene.exposures is None else scene.exposures.expose_directly(render.image, camera)
         gradient = photometric_gradients(shown, target, w.dssim, w.weigh_pixels(shown, target, mask, number))
         gradients = backward_picture(gradient if go_back is None else go_back(gradient))
+        if pose is not None and pose.requires_grad:
+            g = decoded.gaussians
+            pose.backward(pose_gradient(g.means, g.quats, gradients.means, gradients.quats, pose))
         render = replace(render, image=shown)
         terms = LazyMapping(lambda: compute_terms(Sample(decoded, render, target, mask, number), w))
         if w.regularises:  # these see parameters, which the optimiser is about to move

@@ -16,11 +16,12 @@ from torch import Tensor
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.group import Alone
 from scene_experts.core.schedule import passes
-from scene_experts.core.types import Mode
+from scene_experts.core.types import Camera, Mode
 from scene_experts.data.capture import Capture
 from scene_experts.render import Rasterizer, for_training
 from scene_experts.scene import Scene
 from scene_experts.scene.anchors.quantise import ROUNDED
+from scene_experts.scene.poses import at_pose, attach
 from scene_experts.strategy.survey import Survey, TrainingPhoto
 from scene_experts.training.batch import Direct, check_batch, make_exchange
 from scene_experts.training.config import RunConfig, Train, find_unused
@@ -250,7 +251,7 @@ def begin_rate(training: Training, capture: Capture, rasterize: Rasterizer) -> N
     if rate is None or not rate.is_due(training.step):
         return
     columns, device = {name: scene.table.params[name] for name in ROUNDED}, scene.table.device
-    cameras = [capture.views[i].camera.to(device, columns["offsets"].dtype) for i in evenly(capture.train, MOST_VIEWS)]
+    cameras = [camera_of(training, capture, i, device, columns["offsets"].dtype) for i in evenly(capture.train, MOST_VIEWS)]
     background = torch.tensor(capture.background).to(columns["offsets"])
     found = find_sensitivity(scene, columns, training.step, cameras, background, rasterize)
     training.add_groups(rate.begin(scene, found, capture.world.scale))
@@ -284,8 +285,11 @@ def see_view(
         decoded, render, terms = direct.see(scene, camera, number, target, mask, photographs.background(color))
         training.largest.see(decoded, render)
         return Iteration(decoded, render, terms, target, mask)
+    pose = None if scene.poses is None else scene.poses.pose_of(camera)
+    camera = camera if pose is None else at_pose(camera, pose)
     decoded = scene(camera, number, Mode.TRAIN, rasterize.visible)
-    render = rasterize(decoded.gaussians, camera, photographs.background(color))
+    drawn = decoded.gaussians if pose is None else attach(decoded.gaussians, pose)
+    render = rasterize(drawn, camera, photographs.background(color))
     render = replace(render, image=scene.as_photographed(render.image, camera))
     parts = compute_terms(Sample(decoded, render, target, mask, number), cfg.loss)
     loss = torch.stack(list(parts.values())).sum()
@@ -294,6 +298,12 @@ def see_view(
     decoded, render, parts = without_graph((decoded, render, parts))
     training.largest.see(decoded, render)
     return Iteration(decoded, render, parts, target, mask)
+
+
+def camera_of(training: Training, capture: Capture, index: int, device: torch.device | str, dtype: torch.dtype) -> Camera:
+    """Return the camera of a view, of a training view at its refined pose."""
+    camera, poses = capture.views[index].camera.to(device, dtype), training.scene.poses
+    return camera if poses is None else poses.refine(camera)
 
 
 def resident_of(training: Training, run: Job, capture: Capture) -> Resident:
@@ -320,7 +330,8 @@ def survey_of(training: Training, run: Job, capture: Capture, rasterize: Rasteri
     """Return the training views as densification can look at them."""
 
     def photo(index: int) -> TrainingPhoto:
-        camera, (image, mask) = capture.views[index].camera.to(run.device, run.dtype), resident_of(training, run, capture).see(index)
+        camera = camera_of(training, capture, index, run.device, run.dtype)
+        image, mask = resident_of(training, run, capture).see(index)
         exposures = training.scene.exposures
         return TrainingPhoto(camera, image if exposures is None else exposures.undo(image, camera), mask)
 

@@ -37,6 +37,7 @@ from scene_experts.data.settings import Data
 from scene_experts.scene import Scene
 from scene_experts.scene.exposure import Exposures
 from scene_experts.scene.fit import restore_foreign
+from scene_experts.scene.poses import Poses
 from scene_experts.training import capture_place
 from scene_experts.training.capture_place import Lone
 from scene_experts.training.clock import Clock
@@ -259,7 +260,8 @@ def _settle(file: Path, capture: Path) -> Path:
 
 
 def capture_of(run: OpenRun, data: Path | None = None) -> Capture:
-    """Load the capture that a run was trained on. `data` is its new location if it has moved.
+    """Load the capture that a run was trained on, its training cameras where the run has refined
+    them. `data` is its new location if it has moved.
 
     Raises InputError, which names --data, if the capture does not exist or has other views. Other
     views would define another world frame. A scene without a capture has `OpenRun.cameras`.
@@ -274,7 +276,7 @@ def capture_of(run: OpenRun, data: Path | None = None) -> Capture:
         capture.images.close()
         raise InputError(f"expected the capture that {run.path} was trained on, found other views in {capture.root}; give the right --data")
     capture.expect_poses(run.poses, run.path)
-    return capture
+    return capture if run.scene.poses is None else capture.with_cameras(run.scene.poses.refine)
 
 
 def with_capture(run: OpenRun, data: Path | None) -> OpenRun:
@@ -294,7 +296,7 @@ def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun
     with guarding(run, RUN):
         checkpoint.expect(meta, recipe=config.train.recipe)
         scene = restore_foreign(config.train.scaled_scene(), tensors, meta, averaged=True)
-        scene.exposures = Exposures.restore(tensors)
+        scene.exposures, scene.poses = Exposures.restore(tensors), Poses.restore(tensors)
         opened = OpenRun(run, config, scene, int(meta["step"]), Clock.of(meta), meta.get("capture", ""), meta.get("poses", ""))
     return replace(opened, scene=scene.to(device))
 

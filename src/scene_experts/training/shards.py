@@ -167,7 +167,13 @@ class Sharded(Reduced):
 def check_shard(cfg: Train, max_memory: float, viewer: bool) -> None:
     """Raise InputError, which names --shard, if a setting needs all rows in one process."""
     why = cfg.scene.needs_whole_table() or cfg.growth.needs_whole_table()
-    asked = {"--rate": cfg.rate, "--exposure": cfg.exposure, "--max-memory": max_memory > 0, "--viewer": viewer}
+    asked = {
+        "--rate": cfg.rate,
+        "--exposure": cfg.exposure,
+        "--refine-poses": cfg.refine_poses,
+        "--max-memory": max_memory > 0,
+        "--viewer": viewer,
+    }
     why = why or next((flag for flag, given in asked.items() if given), "")
     if why:
         raise InputError(f"expected settings that --shard can divide among the processes, found {why}; leave one of the two out")

@@ -21,9 +21,10 @@ from scene_experts.core.reading.budget import RUN
 from scene_experts.core.reading.source import guarding
 from scene_experts.data.capture import Capture
 from scene_experts.data.settings import Data
-from scene_experts.scene import Scene, SceneConfig, restore_scene
-from scene_experts.scene.exposure import GROUP, Exposures
+from scene_experts.scene import Scene, SceneConfig, exposure, poses, restore_scene
+from scene_experts.scene.exposure import Exposures
 from scene_experts.scene.fit import restore_foreign
+from scene_experts.scene.poses import Poses
 from scene_experts.training.average import Averages
 from scene_experts.training.clock import Clock
 from scene_experts.training.config import RunConfig, Train
@@ -69,7 +70,11 @@ class Training:
         scene.table.attach(self.optimizer)
         self.averages = Averages(scene) if cfg.average.span > 0 else None
         if scene.exposures is not None:
-            self.add_groups({GROUP: [scene.exposures.stops]})
+            self.add_groups({exposure.GROUP: [scene.exposures.stops]})
+        if scene.poses is not None and cfg.refine_poses:
+            self.add_groups({poses.GROUP: [scene.poses.motions]})
+        elif scene.poses is not None:
+            scene.poses.requires_grad_(False)  # those of --init-from
         self.rate = RateTerm(cfg.rate, cfg.seed, cfg.growth, cfg.iterations) if cfg.rate else None
 
     @classmethod
@@ -92,7 +97,7 @@ class Training:
             raise InputError(f"expected at most {cap:,} {traits.rows} to start with, found {n:,}; raise --max-anchors{also}")
         if 0 < cfg.growth.max_anchors < n:
             log.warning("starts with %s rows, more than the recipe's %s: none will be added", f"{n:,}", f"{cfg.growth.max_anchors:,}")
-        scene.exposures = new_exposures(cfg, capture)
+        scene.exposures, scene.poses = new_exposures(cfg, capture), new_poses(cfg, capture)
         return cls(cfg, scene.to(device, dtype))
 
     @classmethod
@@ -135,7 +140,7 @@ class Training:
             with guarding(run, RUN):
                 scene = restore_foreign(cfg.scene, tensors, meta, averaged=True).to(device)
                 scene.forget_rounding()
-                scene.exposures = new_exposures(cfg, capture)
+                scene.exposures, scene.poses = new_exposures(cfg, capture), new_poses(cfg, capture, Poses.restore(tensors))
                 training = cls(cfg, scene.to(device))
         except InputError as error:
             if other := _changes(before.train.scene, now.train.scene, "scene"):
@@ -178,8 +183,9 @@ class Training:
         `batch_rates`."""
         for group in self.optimizer.param_groups:
             own = None if self.rate is None else self.rate.learning_rate(group["name"], self.step)
-            if group["name"] == GROUP and self.scene.exposures is not None:
-                own = self.scene.exposures.learning_rate(self.step, self.cfg.iterations)
+            for name, learned in ((exposure.GROUP, self.scene.exposures), (poses.GROUP, self.scene.poses)):
+                if group["name"] == name and learned is not None:
+                    own = learned.learning_rate(self.step, self.cfg.iterations)
             rate = self.cfg.rates.at(group["name"], self.step, self.cfg.iterations, self.scene.extent) if own is None else own
             group["lr"] = rate * self.cfg.batch**self.cfg.batch_rates
 
@@ -248,7 +254,8 @@ class Training:
         if self.averages is not None:
             out |= self.averages.tensors()
         out |= {} if self.rate is None else self.rate.tensors(self.scene)
-        out |= {} if self.scene.exposures is None else self.scene.exposures.tensors()
+        for learned in (self.scene.exposures, self.scene.poses):
+            out |= {} if learned is None else learned.tensors()
         out["queue"] = torch.tensor(self.queue, dtype=torch.int64)
         return out
 
@@ -271,6 +278,7 @@ class Training:
         check_same(cfg, meta)
         scene = restore_foreign(cfg.scene, tensors, meta)
         scene.exposures = Exposures.restore(tensors) if cfg.exposure else None
+        scene.poses = Poses.restore(tensors)  # without --refine-poses too: those of --init-from
         scene.table.stats = {k.removeprefix("stats."): v for k, v in tensors.items() if k.startswith("stats.")}
         training = cls(cfg, scene.to(device))
         table = training.scene.table
@@ -301,6 +309,17 @@ class Training:
 def new_exposures(cfg: Train, capture: Capture) -> Exposures | None:
     """Return the exposures of a training that begins; None where it learns none."""
     return Exposures([capture.views[i].camera for i in capture.train]) if cfg.exposure else None
+
+
+def new_poses(cfg: Train, capture: Capture, earlier: Poses | None = None) -> Poses | None:
+    """Return the motions of the cameras of a training that begins, from those of an earlier one of
+    the same scene; None where there are none."""
+    if not cfg.refine_poses:
+        return earlier
+    made = Poses([capture.views[i].camera for i in capture.train], capture.extent)
+    if earlier is not None:
+        made.continue_from(earlier)
+    return made
 
 
 def _changes(before: Data | SceneConfig, now: Data | SceneConfig, where: str = "") -> str:

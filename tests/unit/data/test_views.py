@@ -90,3 +90,10 @@ def test_poses_are_those_of_the_captures_own_frame_and_tell_other_frames_apart(t
         assert same_poses(found, unknown) and same_poses(unknown, found)
     single = poses("single", views=1)
     assert single.count(";") == 0 and same_poses(single, single) and not same_poses(single, poses("single moved", views=1, scale=2.0))
+
+
+def test_other_cameras_leave_the_poses_by_which_a_capture_is_known(tmp_path):
+    capture = load(make_capture(tmp_path / "capture", views=3, size=(24, 16), points=20).folder)
+    moved = capture.with_cameras(lambda c: replace(c, world_to_cam=c.world_to_cam + 1))
+    assert torch.equal(moved.views[1].camera.world_to_cam, capture.views[1].camera.world_to_cam + 1)
+    assert moved.poses() == capture.poses() == moved.with_cameras(lambda c: c).poses()

@@ -29,8 +29,9 @@ def test_evaluates_what_the_run_says(tmp_path: Path, monkeypatch: pytest.MonkeyP
     config = RunConfig(cfg, Data(Path("old"), split="mod:4"), versions={"torch": "x"})
     closed: list[bool] = []
     seen: dict[str, Any] = {}
+    scene = SimpleNamespace(poses=None)
     opened = SimpleNamespace(
-        config=config, scene="scene", step=250, clock=Clock(9.0, 17.0, {"cores": 2}), capture="a", poses="four", path=tmp_path, cameras=None
+        config=config, scene=scene, step=250, clock=Clock(9.0, 17.0, {"cores": 2}), capture="a", poses="four", path=tmp_path, cameras=None
     )
     capture = SimpleNamespace(
         root="new",
@@ -54,7 +55,7 @@ def test_evaluates_what_the_run_says(tmp_path: Path, monkeypatch: pytest.MonkeyP
     result = command.evaluate_run(tmp_path, "cpu", Raster(), EvalOptions("train", lpips=False), data=Path("new"))  # type: ignore[arg-type]
     assert result == {"psnr": 1.0} and closed == [True]
     assert seen["data"] == Data(Path("new"), split="mod:4")
-    assert seen["args"] == ("scene", capture, Raster(antialias), tmp_path, EvalOptions("train", lpips=False))
+    assert seen["args"] == (scene, capture, Raster(antialias), tmp_path, EvalOptions("train", lpips=False))
     assert seen["step"] == 250 and seen["poses"] == ("four", tmp_path)
     about = seen["about"]
     assert (about.recipe, about.iterations, about.seed, about.versions) == ("moe-gs", 300, 4, {"torch": "x"})

@@ -56,6 +56,8 @@ def test_the_first_difference_in_the_protocol_is_named():
     assert find_difference(["a", "b"], [one, two]) == ("the same split, found mod8 in a and mod4 in b", "--split")
     with pytest.raises(InputError, match=naming("--split", "--mixed")):
         check_protocol(["a", "b"], [one, two])
+    words = "the same alignment of held-out cameras, found none in a and done in b"
+    assert find_difference(["a", "b"], [one, {**one, "alignment": "done"}]) == (words, "--align-poses")
     one, two = {**one, "mean_pixels": 1536}, {**two, "mean_pixels": 1504}  # views of several sizes
     assert find_difference(["a", "b"], [one, two]) == ("the same split, found mod8 in a and mod4 in b", "--split")
     assert find_difference(["a", "b"], [one, {**one, "mean_pixels": 1504}]) == (

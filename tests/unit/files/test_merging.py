@@ -11,8 +11,10 @@ from scene_experts import cli
 from scene_experts.core.errors import InputError
 from scene_experts.data.blocks import read_plan
 from scene_experts.files.merging import merge_blocks
+from scene_experts.scene.poses import Poses
 from scene_experts.training import run_folder
 from scene_experts.training.run_folder import open_run
+from support.scenes import CAMERA
 from support.synthetic import make_capture
 
 
@@ -150,6 +152,18 @@ def test_runs_with_other_camera_poses_are_refused(planned, tmp_path, monkeypatch
     monkeypatch.setattr(run_folder, "open_run", lambda path: replace(open_run(path), poses=poses[path]))
     with pytest.raises(InputError, match=r"camera poses in \S*" + runs[1].name):
         merge_blocks(plan, runs, tmp_path / "merged")
+
+
+def test_runs_with_refined_poses_are_refused(planned, tmp_path, monkeypatch):
+    def refined(path):
+        run = open_run(path)
+        run.scene.poses = Poses([CAMERA], 1.0)
+        return run
+
+    plan, _ = planned
+    monkeypatch.setattr(run_folder, "open_run", refined)
+    with pytest.raises(InputError, match=r"refined ones in .*; train it without --refine-poses"):
+        merge_blocks(plan, [plan / "run0", plan / "run1"], tmp_path / "merged")
 
 
 def test_a_block_whose_training_has_not_ended_is_told(planned, tmp_path, caplog):

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from scene_experts.geometry.poses import catmull_rom, interpolate_poses, look_at, make_pose, slerp, with_fov
+from scene_experts.geometry.poses import catmull_rom, exp_motion, interpolate_poses, look_at, make_pose, slerp, with_fov
 from scene_experts.geometry.rotation import quat_to_matrix
 from support.scenes import CAMERA
 
@@ -61,3 +61,12 @@ def test_a_field_of_view():
     camera = with_fov(CAMERA, math.radians(90), 200, 100)
     assert camera.fy == pytest.approx(50) and (camera.cx, camera.cy) == (100, 50)
     assert make_pose(torch.zeros(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)).equal(torch.eye(4, dtype=torch.float64))
+
+
+def test_exp_motion_is_a_rotation_about_an_axis_and_a_translation():
+    quarter = exp_motion(torch.tensor([0.0, 0.0, torch.pi / 2, 0.0, 0.0, 0.0], dtype=torch.float64))
+    torch.testing.assert_close(
+        quarter[:3, :3] @ torch.tensor([1.0, 0, 0], dtype=torch.float64), torch.tensor([0.0, 1, 0], dtype=torch.float64)
+    )
+    moved = exp_motion(torch.tensor([0.0, 0, 0, 1, 2, 3], dtype=torch.float64))
+    assert torch.equal(moved[:3, 3], torch.tensor([1.0, 2, 3], dtype=torch.float64))

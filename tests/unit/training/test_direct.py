@@ -13,6 +13,7 @@ from scene_experts.render import choose, for_training
 from scene_experts.scene.anchors import scene as anchors
 from scene_experts.scene.anchors.routers import Margin
 from scene_experts.scene.anchors.select import Octree
+from scene_experts.scene.poses import attach
 from scene_experts.training.direct import DirectStep, ThroughAutograd
 from scene_experts.training.losses import Sample, Weights, compute_terms
 from scene_experts.training.recipes import RECIPES
@@ -57,6 +58,7 @@ CASES = {
     "appearance": (varied("scaffold-gs", scene={"appearance": 5}), 1, ""),
     "appearance and places": (varied("scene-experts", scene={"appearance": 5}), 1, ""),
     "exposures": (replace(varied("scaffold-gs", loss=TERMS), exposure=True), 1, ""),
+    "refined poses": (replace(varied("scaffold-gs", loss=TERMS), refine_poses=True), 1, ""),
     "dropped and displaced": (varied("scaffold-gs", scene=MANY), 1, ""),
     "smoothed": (varied("scaffold-gs", scene={"smoothing": 0.2}, loss=TERMS), 1, ""),
     "masked slots": (varied("scaffold-gs", loss=TERMS), 1, ""),
@@ -104,7 +106,8 @@ def see(capture, cfg, step, name, direct):
         assert isinstance(drawing.drawing, ThroughAutograd) == bool(why)
     else:
         decoded = scene(camera, step, Mode.TRAIN, draw.visible)
-        render = draw(decoded.gaussians, camera, background)
+        g = decoded.gaussians if scene.poses is None else attach(decoded.gaussians, scene.poses.pose_of(camera))
+        render = draw(g, camera, background)
         render = replace(render, image=scene.as_photographed(render.image, camera))
         terms = compute_terms(Sample(decoded, render, target, mask, step), cfg.loss)
         torch.stack(list(terms.values())).sum().backward()
