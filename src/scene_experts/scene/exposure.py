@@ -16,7 +16,7 @@ where the exposure changes from place to place, and 0 where it changes at random
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 from scene_experts.core.schedule import Rate
 from scene_experts.core.types import Camera
+from scene_experts.scene.per_view import PerView
 
 GAMMA = 2.2
 GROUP = "exposure"  # name of the learning rate, and of the tensors in a checkpoint
@@ -33,38 +34,20 @@ RISE = 100  # iterations in which the rate rises linearly to it; a thirtieth of 
 NEAREST = 1e-3  # of d: cameras nearer to a training camera have its gains
 
 
-class Exposures(nn.Module):
+class Exposures(PerView):
     """Gains of the training photographs, by the ids of their cameras."""
 
+    group, learned, buffers_kept = GROUP, "stops", ("ids", "positions", "directions")
     stops: nn.Parameter  # [V, 3] RGB
     positions: Tensor  # [V, 3] trained world
     directions: Tensor  # [V, 3] unit
-    ids: Tensor  # [V] int64
 
     def __init__(self, cameras: Sequence[Camera]) -> None:
         super().__init__()
         self.stops = nn.Parameter(torch.zeros(len(cameras), 3))
-        self.register_buffer("ids", torch.tensor([camera.id for camera in cameras]))
+        self.set_cameras(cameras)
         self.register_buffer("positions", torch.stack([camera.position.cpu().float() for camera in cameras]))
         self.register_buffer("directions", torch.stack([_direction(camera) for camera in cameras]))
-        self.row = {camera.id: i for i, camera in enumerate(cameras)}
-
-    @classmethod
-    def restore(cls, tensors: Mapping[str, Tensor]) -> Exposures | None:
-        """Return those of a checkpoint's tensors; None if it has none."""
-        if f"{GROUP}.stops" not in tensors:
-            return None
-        made = cls.__new__(cls)
-        nn.Module.__init__(made)
-        made.stops = nn.Parameter(tensors[f"{GROUP}.stops"].clone())
-        for name in ("ids", "positions", "directions"):
-            made.register_buffer(name, tensors[f"{GROUP}.{name}"].clone())
-        made.row = {int(id): i for i, id in enumerate(made.ids.tolist())}
-        return made
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors by their names in a checkpoint."""
-        return {f"{GROUP}.{name}": value.detach() for name, value in self.state_dict().items()}
 
     def stops_of(self, camera: Camera) -> Tensor:
         """Return the stops [3] of a camera, relative to the mean of the training photographs."""

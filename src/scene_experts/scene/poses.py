@@ -17,7 +17,7 @@ to first order is taken out, by least squares, so that the scene stays where it 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -27,6 +27,7 @@ from torch import Tensor, nn
 from scene_experts.core.schedule import Rate
 from scene_experts.core.types import Camera, Gaussians
 from scene_experts.geometry.poses import exp_motion
+from scene_experts.scene.per_view import PerView
 
 GROUP = "poses"  # name of the learning rate, and of the tensors in a checkpoint
 RATE = Rate(3e-4, 3e-6)  # rad and extents, from the start of the training to the end
@@ -34,39 +35,21 @@ BEGIN, FULL = 0.05, 0.15  # shares of the training: until the first no pose move
 BUFFERS = ("ids", "gauge", "extent")
 
 
-class Poses(nn.Module):
+class Poses(PerView):
     """Motions of the training cameras, by the ids of their cameras."""
 
+    group, learned, buffers_kept = GROUP, "motions", BUFFERS
     motions: nn.Parameter  # [V, 6] rotation, translation
     gauge: Tensor  # [V, 6, G] orthonormal columns: motions of the whole world
     extent: Tensor  # [] trained world units
-    ids: Tensor  # [V] int64
 
     def __init__(self, cameras: Sequence[Camera], extent: float) -> None:
         """extent: that of the capture, in trained world units."""
         super().__init__()
         self.motions = nn.Parameter(torch.zeros(len(cameras), 6))
-        self.register_buffer("ids", torch.tensor([camera.id for camera in cameras]))
+        self.set_cameras(cameras)
         self.register_buffer("gauge", find_gauge(cameras, extent).float())
         self.register_buffer("extent", torch.tensor(float(extent)))
-        self.row = {camera.id: i for i, camera in enumerate(cameras)}
-
-    @classmethod
-    def restore(cls, tensors: Mapping[str, Tensor]) -> Poses | None:
-        """Return those of a checkpoint's tensors; None if it has none."""
-        if f"{GROUP}.motions" not in tensors:
-            return None
-        made = cls.__new__(cls)
-        nn.Module.__init__(made)
-        made.motions = nn.Parameter(tensors[f"{GROUP}.motions"].clone())
-        for name in BUFFERS:
-            made.register_buffer(name, tensors[f"{GROUP}.{name}"].clone())
-        made.row = {int(id): i for i, id in enumerate(made.ids.tolist())}
-        return made
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors by their names in a checkpoint."""
-        return {f"{GROUP}.{name}": value.detach() for name, value in self.state_dict().items()}
 
     def continue_from(self, earlier: Poses) -> None:
         """Take the motions of the views that an earlier training has refined."""
