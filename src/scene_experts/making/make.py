@@ -152,16 +152,17 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
 
     Raises InputError if the run in the folder was begun with other photographs held out.
     """
-    split = "mod8" if scores else "none"
+    split = "auto" if scores else "none"  # auto: lists beside the poses, such as those of panoramas, else every 8th
     if (folder / "config.json").is_file():
         begun = run_folder.read_config(folder)
         if (begun.data.split == "none") is scores:
-            told = "none was" if begun.data.split == "none" else f"{begun.data.split} was"
+            told = "none was" if begun.data.split == "none" else "some were"
             raise InputError(
                 f"expected a run with the same photographs held out in {folder}, found one where {told}; "
                 f"{'leave --scores out' if scores else 'add --scores'}, or choose another --out"
             )
         say(f"training: continues that in {folder}; to train anew, with other minutes, remove that folder")
+        split = begun.data.split
         capture = load_capture(place, split=split, resolution=begun.data.resolution, seed=begun.train.seed)
         return TrainingPlan(place, split, (0, 0), capture, begun.train, begun=True)
     whole = load_capture(place, split=split)

@@ -32,7 +32,7 @@ from scene_experts.sfm.learned.photographs import Shots
 from scene_experts.sfm.masks import write_masks
 from scene_experts.sfm.options import SfmOptions
 from scene_experts.sfm.pairs import choose_pairs, find_alike
-from scene_experts.sfm.panoramas import choose_held_out, cuts, find_place, take_photos
+from scene_experts.sfm.panoramas import PanoramaRig, choose_held_out, cuts, find_place, take_photos
 from scene_experts.sfm.photos import Photo
 
 LOG, VIDEO, FRAMES = "colmap.log", "video.txt", "frames"
@@ -94,24 +94,7 @@ def reconstruct(
         say(f"{said}, {len(pairs):,} pairs to match" if pairs is not None else said)
         masks = write_masks(found, images, folder / "masks")
         prepare_folder(folder, found, options, masks)
-        request = {
-            "database": str(folder / "database" / "colmap.db"),
-            "images": str(images),
-            "masks": str(folder / "masks") if masks else "",
-            "maps": str(folder / "maps"),
-            "model": str(folder / work.DONE / "model"),
-            "groups": groups,
-            "rig": None if rig is None else rig.plain(),
-            "pairs": None if pairs is None else [(names[i], names[j]) for i, j in pairs],
-            "spare": [],
-            "learned": "",
-            "poses": True,
-            "threads": options.threads or native.count_cores(),
-            "max_side": options.max_side,
-            "camera_model": options.camera_model,
-            "mapper": options.mapper,
-            "seed": options.seed,
-        }
+        request = describe_request(folder, images, groups, rig, bool(masks), pairs, names, options)
         began = time.monotonic()
         spare: list[tuple[int, int]] = []
         if pairs is None:  # the features decide
@@ -138,6 +121,38 @@ def reconstruct(
         work.publish(out)
     shutil.rmtree(out / work.NAME, ignore_errors=True)
     return note
+
+
+def describe_request(
+    folder: Path,
+    images: Path,
+    groups: list[list[str]],
+    rig: PanoramaRig | None,
+    masked: bool,
+    pairs: list[tuple[int, int]] | None,
+    names: list[str],
+    options: SfmOptions,
+) -> dict[str, Any]:
+    """Return what the worker is asked for. groups: names by camera. pairs: of places in `names`; None:
+    the features decide."""
+    return {
+        "database": str(folder / "database" / "colmap.db"),
+        "images": str(images),
+        "masks": str(folder / "masks") if masked else "",
+        "maps": str(folder / "maps"),
+        "model": str(folder / work.DONE / "model"),
+        "groups": groups,
+        "rig": None if rig is None else rig.plain(),
+        "pairs": None if pairs is None else [(names[i], names[j]) for i, j in pairs],
+        "spare": [],
+        "learned": "",
+        "poses": True,
+        "threads": options.threads or native.count_cores(),
+        "max_side": options.max_side,
+        "camera_model": options.camera_model,
+        "mapper": options.mapper,
+        "seed": options.seed,
+    }
 
 
 def run_features(
