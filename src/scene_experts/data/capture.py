@@ -218,6 +218,7 @@ def _assemble(root: Path, kind: str, raw: RawCapture, centred: bool, background:
         states_split=raw.states_split,
         bounds=raw.bounds,
         applied=raw.applied,
+        model=raw.model,
     )
 
 

@@ -38,6 +38,15 @@ def exp_motion(motion: Tensor) -> Tensor:
     return torch.linalg.matrix_exp(twist)
 
 
+def log_motion(pose: Tensor) -> Tensor:
+    """Return the twist [6] float64 of a rigid motion [4, 4] that turns by less than pi: the inverse of
+    `exp_motion`."""
+    from scipy.linalg import logm  # takes long to import, and most commands do not need it
+
+    twist = torch.from_numpy(logm(pose.double().cpu().numpy()).real.copy())
+    return torch.cat([torch.stack([twist[2, 1], twist[0, 2], twist[1, 0]]), twist[:3, 3]])
+
+
 def look_at(position: Tensor, target: Tensor, up: Tensor) -> Tensor:
     """Return the world-to-camera matrix [4, 4] of a camera at `position` that looks at `target`,
     with `up` upwards in its image."""

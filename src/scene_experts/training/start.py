@@ -9,6 +9,7 @@ import torch
 from scene_experts.data.capture import Capture
 from scene_experts.data.dense import NoDenseStartError, start_densely
 from scene_experts.data.settings import Data
+from scene_experts.training.adjusted import adjust_to_tracks
 from scene_experts.training.config import Train
 from scene_experts.training.state import Training
 
@@ -19,8 +20,20 @@ ENOUGH = 26_000
 
 def start(cfg: Train, data: Data, capture: Capture, device: str, dtype: torch.dtype) -> Training:
     """Start a training from the capture's points, or with --init dense, and with few views where the
-    recipe asks for it, from those of `data.dense`. `cfg` must be scaled. Raises InputError as
-    `loop.train`."""
+    recipe asks for it, from those of `data.dense`. Refined poses start where the capture's tracks
+    put them. `cfg` must be scaled. Raises InputError as `loop.train`."""
+    if not cfg.refine_poses:
+        return _start(cfg, data, capture, device, dtype)
+    adjusted = adjust_to_tracks(capture)
+    training = _start(cfg, data, adjusted.capture, device, dtype)
+    assert training.scene.poses is not None
+    given, found = ([of.views[i].camera for i in capture.train] for of in (capture, adjusted.capture))
+    training.scene.poses.begin_at(given, found)
+    training.computed = "; ".join(part for part in (training.computed, adjusted.about) if part)
+    return training
+
+
+def _start(cfg: Train, data: Data, capture: Capture, device: str, dtype: torch.dtype) -> Training:
     few = len(capture.train) <= cfg.dense_views and (capture.points is None or len(capture.points.xyz) < ENOUGH)
     by_recipe = few and data.init == "auto" and data.points is None and not capture.random_points
     if data.init != "dense" and not by_recipe:
