@@ -35,6 +35,8 @@ def read_tracks(capture: Capture, views: Sequence[int]) -> tuple[NDArray[np.floa
         xy, points = model.observations[image.id]
         row = np.searchsorted(ids, points).clip(max=len(ids) - 1)
         known = ids[row] == points
+        if not known.any():
+            continue
         stored = model.cameras[image.camera_id]
         x, y = (xy[known] * (lens.width / stored.width, lens.height / stored.height)).T
         uv = np.stack(lens.undistort((x - lens.cx) / lens.fx, (y - lens.cy) / lens.fy), 1)
@@ -42,7 +44,7 @@ def read_tracks(capture: Capture, views: Sequence[int]) -> tuple[NDArray[np.floa
         n = int(inside.sum())
         focal = np.tile([lens.fx, lens.fy], (n, 1))  # px of the file
         found.append((np.full(n, place), order[row[known][inside]], uv[inside], focal))
-    if not sum(len(place) for place, *_ in found):
+    if not found:
         return None
     xyz = capture.world.from_input(torch.from_numpy(model.xyz)).numpy()
     return xyz, Observations(*map(np.concatenate, zip(*found)))

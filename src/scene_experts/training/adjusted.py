@@ -13,7 +13,7 @@ from scene_experts.data.views import Capture
 from scene_experts.geometry.bundle import adjust
 from scene_experts.scene.poses import at_pose
 
-WORTH = 0.05  # share of the median reprojection error that an adjustment must take off
+WORTH, LEAST = 0.05, 0.02  # share of the median reprojection error that an adjustment must take off, and px
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ def adjust_to_tracks(capture: Capture) -> AdjustedCapture:
     points, seen = tracks
     cameras = [capture.views[i].camera for i in capture.train]
     found = adjust(np.stack([camera.world_to_cam.double().numpy() for camera in cameras]), points, seen)
-    if not found.after < (1 - WORTH) * found.before:
+    if not found.before - found.after > max(WORTH * found.before, LEAST):
         return AdjustedCapture(capture, f"the poses fit the capture's tracks: their median error is {found.before:.2f} px")
     moved = {camera.id: at_pose(camera, torch.from_numpy(pose)) for camera, pose in zip(cameras, found.poses)}
     adjusted = capture.with_cameras(lambda camera: moved.get(camera.id, camera))
