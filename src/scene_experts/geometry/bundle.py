@@ -92,6 +92,17 @@ def _in_camera(poses: Array, points: Array, seen: Observations) -> Array:
     return np.einsum("nij,nj->ni", R, points[seen.point]) + t
 
 
+def _slopes(poses: Array, points: Array, seen: Observations) -> tuple[Array, Array]:
+    """Return the derivatives of the errors by the motions of the cameras [N, 2, 6], as `move` has
+    them, and by the points [N, 2, 3]."""
+    x, y, z = _in_camera(poses, points, seen).T
+    o = np.zeros_like(z)
+    rows = np.stack([np.stack([1 / z, o, -x / z**2], 1), np.stack([o, 1 / z, -y / z**2], 1)], 1)
+    project = rows * seen.focal[:, :, None]  # [N, 2, 3]
+    turn = np.stack([np.stack([o, z, -y], 1), np.stack([-z, o, x], 1), np.stack([y, -x, o], 1)], 1)  # w x p for a turn w
+    return np.concatenate([project @ turn, project], 2), project @ poses[seen.view, :3, :3]
+
+
 def _counted(poses: Array, points: Array, seen: Observations) -> NDArray[np.bool_]:
     """Return which observations count: those in front of their camera, of points with at least two
     of them."""
@@ -115,14 +126,7 @@ class _System:
     def __init__(self, poses: Array, points: Array, seen: Observations, limit: float) -> None:
         self.poses, self.points, self.seen = poses, points, seen
         self.loss = _loss(poses, points, seen, limit)
-        inside = _in_camera(poses, points, seen)
-        errors = find_errors(poses, points, seen)
-        x, y, z = inside.T
-        o = np.zeros_like(z)
-        project = np.stack([np.stack([1 / z, o, -x / z**2], 1), np.stack([o, 1 / z, -y / z**2], 1)], 1) * seen.focal[:, :, None]  # [N, 2, 3]
-        turn = np.stack([np.stack([o, z, -y], 1), np.stack([-z, o, x], 1), np.stack([y, -x, o], 1)], 1)  # -[p]x, of a turn w: w x p
-        by_camera = np.concatenate([project @ turn, project], 2)  # [N, 2, 6]
-        by_point = project @ poses[seen.view, :3, :3]  # [N, 2, 3]
+        errors, (by_camera, by_point) = find_errors(poses, points, seen), _slopes(poses, points, seen)
         size = np.linalg.norm(errors, axis=1)
         weight = np.minimum(1.0, limit / np.maximum(size, 1e-12))[:, None, None]
         weighted = np.swapaxes(by_camera, 1, 2) * weight
@@ -181,5 +185,5 @@ def _damped(blocks: Array, damping: float) -> Array:
 def _gather(rows: Array, where: NDArray[np.int64], count: int) -> Array:
     """Return the sum [count, ...] of the rows [N, ...] by their index."""
     flat = rows.reshape(len(rows), -1)
-    out = np.stack([np.bincount(where, column, minlength=count) for column in flat.T], 1) if flat.shape[1] else flat
+    out = np.stack([np.bincount(where, column, minlength=count).astype(np.float64) for column in flat.T], 1)
     return out.reshape(count, *rows.shape[1:])

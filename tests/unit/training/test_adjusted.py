@@ -41,9 +41,9 @@ def test_training_cameras_and_points_fit_the_tracks(folder, tmp_path):
 def test_points_of_another_file_stay(folder, tmp_path):
     given = load(folder)
     cloud = tmp_path / "points.ply"
-    np.savetxt(cloud, given.world.to_input(given.points.xyz).numpy() + 0.01, header=(
-        f"ply\nformat ascii 1.0\nelement vertex {len(given.points.xyz)}\nproperty double x\nproperty double y\nproperty double z\nend_header"
-    ), comments="")  # fmt: skip
+    head = "ply\nformat ascii 1.0\nelement vertex {}\nproperty double x\nproperty double y\nproperty double z\nend_header"
+    xyz = given.world.to_input(given.points.xyz).numpy() + 0.01
+    np.savetxt(cloud, xyz, header=head.format(len(xyz)), comments="")
     other = load(folder, points=cloud)
     found = adjust_to_tracks(other)
     assert torch.equal(found.capture.points.xyz, other.points.xyz)
