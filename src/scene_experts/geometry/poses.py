@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -43,7 +44,7 @@ def log_motion(pose: Tensor) -> Tensor:
     `exp_motion`."""
     from scipy.linalg import logm  # takes long to import, and most commands do not need it
 
-    twist = torch.from_numpy(logm(pose.double().cpu().numpy()).real.copy())
+    twist = torch.from_numpy(np.real(np.asarray(logm(pose.double().cpu().numpy()))).copy())
     return torch.cat([torch.stack([twist[2, 1], twist[0, 2], twist[1, 0]]), twist[:3, 3]])
 
 
