@@ -28,6 +28,7 @@ from scene_experts.training.config import RunConfig, Train, find_unused
 from scene_experts.training.direct import DirectStep
 from scene_experts.training.events import Densified, Event, Finished, Previewed, Saved, Started, Stopped
 from scene_experts.training.guard import explain, find_broken
+from scene_experts.training.init_from import start_from
 from scene_experts.training.losses import Sample, compute_terms
 from scene_experts.training.measure import Iteration, measure_step
 from scene_experts.training.memory import anchor_cap, give_back, peak_bytes
@@ -155,7 +156,7 @@ def begin(cfg: Train, run: Job, capture: Capture, folder: Path | None, rasterize
     if training and training.chosen not in (None, capture.chosen()):
         raise InputError("expected the training views that this run began with, found others; restore the file of --views, or train anew")
     if training is None and run.config.init_from is not None:
-        training = Training.start_from(cfg, run.config.init_from, capture, run.device, run.config)
+        training = start_from(cfg, run.config.init_from, capture, run.device, run.config)
         if run.config.data.init == "dense":
             log.warning("--init dense has no effect with --init-from, whose scene is there already; leave it out")
         if training.step >= last_iteration(cfg, run):
