@@ -32,7 +32,7 @@ from scene_experts.training.background import with_background
 from scene_experts.training.batch import check_batch
 from scene_experts.training.config import RunConfig, Train, with_numbers
 from scene_experts.training.events import Exported, Stopped
-from scene_experts.training.loop import Job
+from scene_experts.training.job import Job
 from scene_experts.training.memory import reuse_freed
 from scene_experts.training.options import TrainOptions
 from scene_experts.training.progress import TrainingProgress
