@@ -27,6 +27,7 @@ from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.catalog import defaults_in
 from scene_experts.data.settings import Data
 from scene_experts.render import Rasterizer
+from scene_experts.sfm.drift import warn_of_steady
 from scene_experts.training import run_folder
 from scene_experts.training.background import with_background
 from scene_experts.training.batch import check_batch
@@ -106,7 +107,8 @@ def train(args: list[str]) -> int:
     line = shlex.join([PROG, "train", *(arg for arg in args if arg != "--resume")])  # the command of the whole run
     command, run, capture, rasterize = group.agree(lambda: prepare(command, line, group))
     console = Console(markup=False, highlight=False, quiet=not group.first)
-    for warning in capture.warnings if group.first else ():
+    steady = warn_of_steady(capture.root) if command.cfg.exposure else None
+    for warning in (*capture.warnings, *([steady] if steady else [])) if group.first else ():
         print(f"warning: {warning}", file=sys.stderr)
     what = f"{command.cfg.recipe} on {capture.name} ({len(capture.train)} training views, {len(capture.test)} held out)"
     together = f", {group.size} processes" if group.size > 1 else ""
