@@ -17,13 +17,12 @@ from scene_experts.core.io import read_json, write_atomic, write_json
 from scene_experts.core.reading.budget import CAPTURED
 from scene_experts.core.reading.pictures import opening_picture
 from scene_experts.data.colour import is_deep, lift, to_8_bit
-from scene_experts.data.equirectangular import FIELD, VIEWS, find_places, mask_nadir, sample, view_side
+from scene_experts.data.equirectangular import FIELD, FOLDERS, VIEWS, find_place, find_places, mask_nadir, sample, view_side
 from scene_experts.data.masks import Mask
 from scene_experts.sfm.options import SfmOptions
 from scene_experts.sfm.photos import ORIENTATION, Photo, check_in_place, copy_photos, natural_key, read_stored_mask, turn_upright
 
 CUT = "cut.json"
-FOLDERS = frozenset(view.folder for view in VIEWS)
 
 
 @dataclass(frozen=True)
@@ -78,12 +77,6 @@ def take_photos(
     instead = "--panoramas keep takes them as perspective pictures"
     say(f"{len(turned)} of {len(found)} photographs are 360 degree panoramas: {made}{below} ({instead})")
     return [*copied, *views], rig
-
-
-def find_place(name: str) -> str:
-    """Return the panorama that a photograph was cut from; of others, their own name."""
-    folder, _, rest = name.partition("/")
-    return rest if folder in FOLDERS else name
 
 
 def choose_held_out(names: Sequence[str]) -> list[str]:

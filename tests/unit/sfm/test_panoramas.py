@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scene_experts.data.equirectangular import VIEWS
+from scene_experts.data.equirectangular import VIEWS, find_place
 from scene_experts.sfm import reconstruct as run
 from scene_experts.sfm.options import SfmOptions
-from scene_experts.sfm.panoramas import PanoramaRig, choose_held_out, cut_panoramas, find_place
+from scene_experts.sfm.panoramas import PanoramaRig, choose_held_out, cut_panoramas
 from scene_experts.sfm.photos import find_photos
 from support.captures import load
 from support.rooms import draw_panorama, paint_walls
