@@ -30,7 +30,7 @@ from scene_experts.geometry.poses import exp_motion, log_motion
 from scene_experts.scene.per_view import PerView
 
 GROUP = "poses"  # name of the learning rate, and of the tensors in a checkpoint
-RATE = Rate(3e-4, 3e-6)  # rad and extents, from the start of the training to the end
+RATE = Rate(1e-4, 1e-6)  # rad and extents, from the start of the training to the end
 BEGIN, FULL = 0.05, 0.15  # shares of the training: until the first no pose moves, from the second on at the whole rate
 BUFFERS = ("ids", "gauge", "extent", "begun")
 
