@@ -26,6 +26,7 @@ from scene_experts.training.config import RunConfig, with_numbers
 from scene_experts.training.events import Event
 from scene_experts.training.job import Job
 from scene_experts.training.memory import forget_peak, reuse_freed
+from scene_experts.training.nearest import with_near_plane
 from scene_experts.training.options import TrainOptions
 from scene_experts.training.progress import TrainingProgress
 from scene_experts.training.run_folder import OpenRun
@@ -111,6 +112,7 @@ class Trainer:
             run_folder.check(folder, config, resume, overwrite)
             config = run_folder.as_begun(folder, config) if resume else config
         config, behind = with_background(config, self.capture.loaded)
+        config, behind = with_near_plane(config, behind)
         self.capture = Capture(config.data, behind, self.capture.seed, self.capture.numbers)
         self._run = Job(config, folder, where, options=options, begin=self._begin)
         self._rasterize = rasterize

@@ -35,6 +35,7 @@ from scene_experts.training.config import RunConfig, Train, with_numbers
 from scene_experts.training.events import Exported, Stopped
 from scene_experts.training.job import Job
 from scene_experts.training.memory import reuse_freed
+from scene_experts.training.nearest import with_near_plane
 from scene_experts.training.options import TrainOptions
 from scene_experts.training.progress import TrainingProgress
 from scene_experts.training.recipes import RECIPES
@@ -116,6 +117,8 @@ def train(args: list[str]) -> int:
     if run.config.data.background != command.data.background:
         colour = " ".join(f"{value:g}" for value in capture.background)
         console.print(f"background: the photographs' mean colour, {colour} (choose another with --background)", soft_wrap=True)
+    if run.config.data.near != command.data.near:
+        console.print(f"near plane: {run.config.data.near:g}, by what the photographs show (choose another with --near)", soft_wrap=True)
     code = follow(command, run, capture, rasterize, console)
     group.leave()
     return code
@@ -146,7 +149,7 @@ def prepare(command: TrainCommand, line: str, group: Alone) -> tuple[TrainComman
     )
     run_folder.check(command.out, run.config, options.resume, options.overwrite)
     begun = run_folder.as_begun(command.out, run.config) if options.resume else run.config
-    config, capture = with_background(begun, captures.load(begun.data, command.cfg.seed))
+    config, capture = with_near_plane(*with_background(begun, captures.load(begun.data, command.cfg.seed)))
     return command, replace(run, config=config, device=device), capture, rasterize
 
 
