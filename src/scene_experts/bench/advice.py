@@ -27,6 +27,7 @@ SIDES = ((0, 7000), (1200, 7000), (800, 7000), (800, 4000), (600, 4000), (600, 3
 # others.
 FEW, FEW_ITERATIONS = 30, 4000
 BASE, PER_MEGAPIXEL = 4.5, 9.8
+FREE = 0.85  # share of the processor from which a machine counts as idle
 SERIAL = 0.15  # share of an iteration that one thread does
 
 
@@ -47,8 +48,15 @@ class Advice:
         side = [] if self.side == 0 else ["--resolution", f"longest:{self.side}"]
         return [*side, "--iterations", str(self.iterations)]
 
-    def __str__(self) -> str:
-        return "" if self.minutes is None else f"about {max(1, round(self.minutes))} min on this machine if it is not busy"
+    def tell(self, share: float) -> str:
+        """Say how long it takes where it gets this share of the processor (`measure_share`); empty
+        if that is not known."""
+        if self.minutes is None:
+            return ""
+        alone = f"about {max(1, round(self.minutes))} min"
+        if share >= FREE:
+            return f"{alone} on this machine"
+        return f"about {max(1, round(self.minutes / share))} min beside what else this machine does now ({alone} alone)"
 
 
 def measure_picture() -> float:

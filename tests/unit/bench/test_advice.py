@@ -41,4 +41,10 @@ def test_few_photographs_get_a_shorter_training():
 def test_the_time_is_below_the_limit_where_that_can_be(picture):
     found = advice.suggest(4000, 3000, 100, picture)
     assert found.minutes <= advice.LIMIT or found.flags == advice.suggest(4000, 3000, 100, 10.0).flags
-    assert "min on this machine" in str(found)
+
+
+def test_a_busy_machine_is_told_with_its_share():
+    found = advice.Advice(800, 4000, 6.0)
+    assert found.tell(1.0) == "about 6 min on this machine"
+    assert "about 15 min beside" in found.tell(0.4) and "about 6 min alone" in found.tell(0.4)
+    assert advice.Advice(0, 30_000, None).tell(0.5) == ""

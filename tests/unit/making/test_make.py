@@ -1,15 +1,17 @@
 """A page from photographs: which stages run, with what, and what a repeated call does."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import pytest
 
 from scene_experts.bench.advice import Advice
+from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
 from scene_experts.making import make as making
 from scene_experts.making.make import make
+from scene_experts.sfm.options import SfmOptions, SourceOptions
 from scene_experts.training.events import Stepped
 from scene_experts.training.recipes import PROPOSED
 from support.messages import naming
@@ -62,6 +64,7 @@ def trained(monkeypatch):
     monkeypatch.setattr(making.run_folder, "open_run", lambda folder: None)
     plan = lambda width, height, views, have, slow=1.0: Advice(0, 1000 if have is None or slow == 1 else round(have / slow * 10), 1.0)  # noqa: E731
     monkeypatch.setattr(making, "plan_training", plan)
+    monkeypatch.setattr(making, "measure_share", lambda threads: 1.0)
     return SimpleNamespace(made=made, Trainer=Trainer)
 
 
@@ -108,18 +111,36 @@ def test_photographs_get_poses_first(tmp_path, capture, trained, monkeypatch):
     asked = []
 
     def reconstruct(source, out, options, say, progress):
-        asked.append(out)
+        asked.append((out, options))
         make_capture(out, views=9, size=(48, 32), points=200)
-        return {"with_pose": 9, "photographs": 9, "points": 200}
+        (out / "capture.json").write_text(json.dumps({"options": asdict(options)}))
+        return {"with_pose": 9, "photographs": 10, "points": 200, "without_pose": ["a.jpg"], "apart": [], "all_compared": True}
 
     monkeypatch.setattr(making, "reconstruct", reconstruct)
     (tmp_path / "photos").mkdir()
+    said, options = [], SourceOptions(nadir=20.0)
     for _ in range(2):
-        made = make(tmp_path / "photos", tmp_path / "out", say=lambda _: None)
-    assert asked == [tmp_path / "out" / "capture"] and made.capture == asked[0]
+        made = make(tmp_path / "photos", tmp_path / "out", options=options, say=said.append)
+    assert asked == [(tmp_path / "out" / "capture", SfmOptions(nadir=20.0))] and made.capture == asked[0][0]
+    assert "photographs without a pose: a.jpg" in said
+    with pytest.raises(InputError, match=naming("--nadir 20.0")):
+        make(tmp_path / "photos", tmp_path / "out", say=lambda _: None)
     (tmp_path / "others").mkdir()
     with pytest.raises(InputError, match=naming(tmp_path / "others")):
         make(tmp_path / "others", tmp_path / "out", say=lambda _: None)
+
+
+def test_a_capture_has_its_poses(capture, tmp_path):
+    with pytest.raises(InputError, match="--panoramas"):
+        make(capture, tmp_path / "out", options=SourceOptions(panoramas="keep"))
+
+
+def test_a_repeated_call_says_how_far_the_training_is(tmp_path):
+    config = SimpleNamespace(train=SimpleNamespace(iterations=500), data=SimpleNamespace(resolution="auto"))
+    assert "at iteration 0" in making.describe_begun(tmp_path, config)
+    checkpoint.save(tmp_path / "checkpoints", 500, {}, {})
+    told = making.describe_begun(tmp_path, config)
+    assert "is complete: 500" in told and "--minutes" in told and str(tmp_path) in told
 
 
 def test_no_time_is_no_budget(tmp_path):
