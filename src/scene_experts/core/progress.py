@@ -17,7 +17,7 @@ TICK = 0.5  # seconds between the times that are kept for it
 SOON = 2.0  # seconds from which a speed says something
 
 
-class Pace:
+class Speedometer:
     """The speed of a work in its last RECENT seconds. The first call only begins it: what was done
     before, and what starting took, say nothing of the speed."""
 

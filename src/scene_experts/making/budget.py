@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from scene_experts.bench.advice import FEW, Advice, suggest
-from scene_experts.core.progress import Pace, Progress
+from scene_experts.core.progress import Progress, Speedometer
 from scene_experts.training.progress import format_duration
 
 FOR_PAGE = 0.05  # share of the time after the poses that the page gets
@@ -53,14 +53,14 @@ class Whole:
     later stages are expected to take."""
 
     def __init__(self, progress: Progress, now: Callable[[], float] = time.monotonic) -> None:
-        self.progress, self.now, self.what, self.pace = progress, now, "", Pace(now)
+        self.progress, self.now, self.what, self.pace = progress, now, "", Speedometer(now)
         self.later = 0.0  # seconds of the stages after this one
         self.least: Callable[[], float] = lambda: 0.0  # seconds that the whole takes in any case
 
     def __call__(self, what: str, done: int, total: int) -> None:
         """Show that `done` of `total` parts of the work `what` are done."""
         if what != self.what:
-            self.what, self.pace = what, Pace(self.now)
+            self.what, self.pace = what, Speedometer(self.now)
         speed = self.pace(done)
         if speed is None or total <= 0:
             self.progress(what, done, total)

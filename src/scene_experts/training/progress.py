@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, Tim
 from rich.progress import Progress as TaskBar
 from rich.text import Text
 
-from scene_experts.core.progress import Pace
+from scene_experts.core.progress import Speedometer
 from scene_experts.scene import Traits
 from scene_experts.training.events import Densified, Event, Exported, Finished, Previewed, Saved, Started, Stepped, Stopped
 
@@ -41,7 +41,7 @@ class TrainingProgress:
     psnr: float | None
     traits: Traits
     pictured: bool
-    pace: Pace
+    pace: Speedometer
 
     def __init__(self, console: Console, every: float = 15.0, out: Path | None = None) -> None:
         self.console, self.every, self.out, self.pictured = console, every, out, False
@@ -49,7 +49,7 @@ class TrainingProgress:
         self.total, self.first, self.began, self.printed = 0, 0, time.perf_counter(), 0.0
         self.loss, self.psnr = {}, None
         self.traits = Traits("", "rows")
-        self.pace = Pace()
+        self.pace = Speedometer()
 
     def __enter__(self) -> TrainingProgress:
         if self.live:
@@ -65,7 +65,7 @@ class TrainingProgress:
         match event:
             case Started():
                 self.total, self.first, self.began = event.total, event.step, time.perf_counter()
-                self.pace = Pace()
+                self.pace = Speedometer()
                 verb = f"resumed at iteration {event.step:,}" if event.step else "started"
                 self.traits, rows = event.traits, event.traits.rows
                 lattice = f" on a lattice of {event.traits.voxel:.3g}" if event.traits.voxel else ""
@@ -143,14 +143,14 @@ class ProgressBar:
     bar: TaskBar
     task: TaskID
     what: str
-    pace: Pace
+    pace: Speedometer
 
     def __init__(self, console: Console, every: float = 15.0) -> None:
         self.console, self.every, self.printed = console, every, time.monotonic()
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
         self.bar = TaskBar(*columns, console=console, transient=True)
         self.task = self.bar.add_task("opening", total=None)
-        self.what, self.pace = "", Pace()
+        self.what, self.pace = "", Speedometer()
 
     def __enter__(self) -> ProgressBar:
         if self.console.is_terminal:
@@ -164,7 +164,7 @@ class ProgressBar:
     def __call__(self, what: str, done: int, total: int) -> None:
         """Show that `done` of `total` parts of the work `what` are done."""
         if what.partition(" (")[0] != self.what.partition(" (")[0]:  # another work: the speed of the last one says nothing
-            self.pace = Pace()
+            self.pace = Speedometer()
             self.bar.reset(self.task)
         self.what, speed = what, self.pace(done)
         self.bar.update(self.task, description=what, completed=done, total=total)

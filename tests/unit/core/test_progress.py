@@ -2,12 +2,12 @@
 
 import pytest
 
-from scene_experts.core.progress import RECENT, Pace
+from scene_experts.core.progress import RECENT, Speedometer
 
 
 def test_the_speed_is_that_of_the_last_seconds():
     clock, done = [100.0], 0
-    pace = Pace(lambda: clock[0])
+    pace = Speedometer(lambda: clock[0])
     assert pace(5) is None  # what was done before says nothing
     clock[0] += 1.0
     assert pace(15) is None  # too soon
@@ -24,7 +24,7 @@ def test_the_speed_is_that_of_the_last_seconds():
 
 def test_work_that_does_not_move_has_no_speed():
     clock = [0.0]
-    pace = Pace(lambda: clock[0])
+    pace = Speedometer(lambda: clock[0])
     pace(0)
     clock[0] += 10.0
     assert pace(0) is None

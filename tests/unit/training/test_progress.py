@@ -4,7 +4,7 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
-from scene_experts.core.progress import Pace
+from scene_experts.core.progress import Speedometer
 from scene_experts.scene import Traits
 from scene_experts.strategy import Edit
 from scene_experts.training.events import Densified, Exported, Finished, Previewed, Saved, Started, Stepped, Stopped
@@ -80,7 +80,7 @@ def test_the_first_picture_has_its_place():
 
 def test_the_time_left_is_that_of_the_measured_speed(monkeypatch):
     out, clock = io.StringIO(), [0.0]
-    monkeypatch.setattr("scene_experts.training.progress.Pace", lambda: Pace(lambda: clock[0]))
+    monkeypatch.setattr("scene_experts.training.progress.Speedometer", lambda: Speedometer(lambda: clock[0]))
     with TrainingProgress(Console(file=out, width=200), every=0.0) as show:
         show(Started(0, 200, 1234, Traits("anchors", "anchors")))
         for step in (10, 50):
@@ -101,7 +101,7 @@ def test_a_bar_prints_lines_without_a_terminal():
     assert console.file.getvalue() == "rendering: 3 of 9\n"  # type: ignore[attr-defined]
     clock = [0.0]
     with ProgressBar(console, every=0.0) as tell:
-        tell.pace = Pace(lambda: clock[0])
+        tell.pace = Speedometer(lambda: clock[0])
         tell.what = "refining"
         for done in (100, 200):
             tell("refining", done, 1000)
