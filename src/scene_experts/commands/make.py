@@ -31,7 +31,8 @@ class MakeCommand:
     out: Annotated[Path | None, Option(value="FOLDER")] = None
     """Folder to write; by default the name of PHOTOS with -scene, in this folder."""
     minutes: NotNegative = 0.0
-    """Time for the whole; it decides iterations, resolution and effort. 0: what `info` proposes."""
+    """Time for the whole; it decides iterations, resolution and effort. 0: a training of at most 8
+    minutes on this machine if it is not busy."""
     scores: bool = False
     """Hold out every 8th photograph, score it, and write a report. Otherwise all photographs are
     trained on."""
