@@ -136,9 +136,8 @@ def find_poses(source: Path, folder: Path, options: SourceOptions, say: Callable
         expect_same(place, options)
         say(f"poses: those in {place}; after a change of the photographs, remove that folder and {folder / RUN}")
         return place
-    folder.mkdir(parents=True, exist_ok=True)
-    write_json(note, {"source": here})
     found = reconstruct(source, place, SfmOptions(**asdict(options)), say=say, progress=progress)
+    write_json(note, {"source": here})
     say(f"poses: {found['with_pose']} of {found['photographs']} photographs, {found['points']:,} points")
     for line in explain_lacking(found, f"--matching exhaustive --out {folder}-2"):
         say(line)

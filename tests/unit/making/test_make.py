@@ -143,6 +143,12 @@ def test_a_repeated_call_says_how_far_the_training_is(tmp_path):
     assert "is complete: 500" in told and "--minutes" in told and str(tmp_path) in told
 
 
+def test_photographs_that_are_not_there_leave_no_folder(tmp_path):
+    with pytest.raises(InputError, match="none"):
+        make(tmp_path / "none", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_no_time_is_no_budget(tmp_path):
     with pytest.raises(InputError, match="minutes"):
         make(tmp_path, minutes=0.0)
