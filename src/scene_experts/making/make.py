@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from statistics import fmean
@@ -22,6 +24,7 @@ from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.fields import flag_of
 from scene_experts.core.io import read_json, write_json
 from scene_experts.core.progress import Progress
+from scene_experts.core.signals import handled
 from scene_experts.data.readers import is_capture
 from scene_experts.files.export import export_several
 from scene_experts.files.options import Options
@@ -32,11 +35,12 @@ from scene_experts.sfm.options import SfmOptions, SourceOptions
 from scene_experts.sfm.reconstruct import NOTE, reconstruct
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
-from scene_experts.training.events import Stepped
+from scene_experts.training.events import Event, Stepped
 from scene_experts.training.recipes import PROPOSED
 
 CAPTURE, RUN, PAGE, SOURCE = "capture", "run", "scene.html", "source.json"
 PLAIN = SourceOptions()
+SAVE_EVERY = 1000  # iterations that a killed training loses at most
 RECENT = 200  # iterations whose time counts as that of one at the end
 
 
@@ -235,9 +239,10 @@ def train(
     settled = plan.begun
     while True:
         have, slow = budget.for_training(scores), None
-        trainer = Trainer(plan.recipe, plan.capture, folder, resume=plan.begun, overwrite=not plan.begun, preview_every=0)
+        again = {"resume": plan.begun, "overwrite": not plan.begun}
+        trainer = Trainer(plan.recipe, plan.capture, folder, **again, preview_every=0, save_every=SAVE_EVERY)
         recent: list[Stepped] = []
-        for event in trainer:
+        for event in saved_when_interrupted(trainer):
             if not isinstance(event, Stepped):
                 continue
             progress("training", event.step, plan.recipe.iterations)
@@ -255,6 +260,23 @@ def train(
         say(f"the machine is {how} than estimated: the training begins anew, {now}")
     psnr = fmean(one.psnr for one in recent) if recent else None
     return trainer.run, psnr
+
+
+def saved_when_interrupted(trainer: Trainer) -> Iterator[Event]:
+    """Yield the events of a training. The first signal that ends a command saves it and then raises
+    KeyboardInterrupt, the second raises it at once."""
+    asked: list[int] = []
+
+    def stop(number: int, _: object) -> None:
+        if asked:
+            raise KeyboardInterrupt
+        asked.append(number)
+        trainer.stop("interrupted")
+
+    with handled(stop) if threading.current_thread() is threading.main_thread() else nullcontext():
+        yield from trainer
+    if asked:
+        raise KeyboardInterrupt
 
 
 def write_page(folder: Path, options: Options, progress: Progress) -> Path:

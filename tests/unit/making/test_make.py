@@ -1,6 +1,7 @@
 """A page from photographs: which stages run, with what, and what a repeated call does."""
 
 import json
+import signal
 from dataclasses import asdict, replace
 from types import SimpleNamespace
 
@@ -35,7 +36,7 @@ def trained(monkeypatch):
     class Trainer:
         seconds = 0.01
 
-        def __init__(self, recipe, capture, folder, resume, overwrite, preview_every):
+        def __init__(self, recipe, capture, folder, resume, overwrite, preview_every, save_every):
             self.recipe, self.capture, self.folder, self.stopped = recipe, capture, folder, False
             self.resume, self.run = (
                 resume,
@@ -141,6 +142,20 @@ def test_a_repeated_call_says_how_far_the_training_is(tmp_path):
     checkpoint.save(tmp_path / "checkpoints", 500, {}, {})
     told = making.describe_begun(tmp_path, config)
     assert "is complete: 500" in told and "--minutes" in told and str(tmp_path) in told
+
+
+def test_an_interrupted_training_is_saved_first(capture, tmp_path, trained, monkeypatch):
+    class Interrupted(trained.Trainer):
+        def __iter__(self):
+            for event in super().__iter__():
+                if event.step == 50:
+                    signal.raise_signal(signal.SIGINT)
+                yield event
+
+    monkeypatch.setattr(making, "Trainer", Interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        make(capture, tmp_path / "out", say=lambda _: None)
+    assert trained.made[0].stopped and not (tmp_path / "out" / "scene.html").exists()
 
 
 def test_photographs_that_are_not_there_leave_no_folder(tmp_path):
