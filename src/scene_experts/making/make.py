@@ -239,8 +239,8 @@ def train(
     settled = plan.begun
     while True:
         have, slow = budget.for_training(scores), None
-        again = {"resume": plan.begun, "overwrite": not plan.begun}
-        trainer = Trainer(plan.recipe, plan.capture, folder, **again, preview_every=0, save_every=SAVE_EVERY)
+        begun = plan.begun
+        trainer = Trainer(plan.recipe, plan.capture, folder, resume=begun, overwrite=not begun, preview_every=0, save_every=SAVE_EVERY)
         recent: list[Stepped] = []
         for event in saved_when_interrupted(trainer):
             if not isinstance(event, Stepped):
