@@ -19,7 +19,7 @@ trainings of 4,000 iterations on banana, brighton, fern and kitchen."""
 LOOK = 0.1  # share of the iterations after which the speed is known
 CLOSE = (0.8, 1.3)  # a training whose time will be this share of what it has is not begun anew
 LEAST, MOST, MOST_OF_FEW = 300, 30_000, 7_000  # iterations; the last with few photographs (`bench.advice.FEW`)
-PAGE_GUESS = 20.0  # seconds, before anything is known
+PAGE_GUESS, SCORES_GUESS = 20.0, 40.0  # seconds, before anything is known
 
 
 @dataclass(frozen=True)

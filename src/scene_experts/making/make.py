@@ -28,7 +28,7 @@ from scene_experts.core.signals import handled
 from scene_experts.data.readers import is_capture
 from scene_experts.files.export import export_several
 from scene_experts.files.options import Options
-from scene_experts.making.budget import LOOK, PAGE_GUESS, TimeBudget, Whole, find_slowness, plan_training
+from scene_experts.making.budget import LOOK, PAGE_GUESS, SCORES_GUESS, TimeBudget, Whole, find_slowness, plan_training
 from scene_experts.sfm.drift import drifts
 from scene_experts.sfm.lacking import explain_lacking
 from scene_experts.sfm.options import SfmOptions, SourceOptions
@@ -104,7 +104,8 @@ def make(
     place = find_poses(source, folder, options, say, show)
     took["poses"], show.least = monotonic() - began, lambda: 0.0
     plan = prepare(place, folder / RUN, budget, scores, say)
-    show.later, began = PAGE_GUESS if budget.left is None else budget.left - (budget.for_training(scores) or 0.0), monotonic()
+    rest = PAGE_GUESS + (SCORES_GUESS if scores else 0.0)
+    show.later, began = rest if budget.left is None else budget.left - (budget.for_training(scores) or 0.0), monotonic()
     run, psnr = train(plan, folder / RUN, budget, scores, show, say)
     took["training"] = monotonic() - began
     report, began, show.later = None, monotonic(), 0.0
