@@ -8,8 +8,9 @@ from dataclasses import dataclass, field, replace
 
 from scene_experts.bench.advice import FEW, Advice, suggest
 from scene_experts.core.progress import Progress, Speedometer
-from scene_experts.training.progress import format_duration
+from scene_experts.training.progress import count_left, format_duration
 
+TRAINING = "training"  # the work whose parts become longer
 FOR_PAGE = 0.05  # share of the time after the poses that the page gets
 LEAST_PAGE, MOST_PAGE = 15.0, 60.0  # seconds of it
 FOR_SCORES = 0.15  # the same for the scores, where they are asked for
@@ -65,7 +66,8 @@ class Whole:
         if speed is None or total <= 0:
             self.progress(what, done, total)
             return
-        left = max(max(0, total - done) / speed + self.later, self.least())
+        parts = count_left(done, total) if what == TRAINING else max(0, total - done)
+        left = max(parts / speed + self.later, self.least())
         self.progress(f"{what} (about {format_duration(left)} left in all)", done, total)
 
 

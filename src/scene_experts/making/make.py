@@ -28,7 +28,7 @@ from scene_experts.core.signals import handled
 from scene_experts.data.readers import is_capture
 from scene_experts.files.export import export_several
 from scene_experts.files.options import Options
-from scene_experts.making.budget import LOOK, PAGE_GUESS, SCORES_GUESS, TimeBudget, Whole, find_slowness, plan_training
+from scene_experts.making.budget import LOOK, PAGE_GUESS, SCORES_GUESS, TRAINING, TimeBudget, Whole, find_slowness, plan_training
 from scene_experts.sfm.drift import drifts
 from scene_experts.sfm.lacking import explain_lacking
 from scene_experts.sfm.options import SfmOptions, SourceOptions
@@ -246,7 +246,7 @@ def train(
         for event in saved_when_interrupted(trainer):
             if not isinstance(event, Stepped):
                 continue
-            progress("training", event.step, plan.recipe.iterations)
+            progress(TRAINING, event.step, plan.recipe.iterations)
             recent = [*(one for one in recent if event.step - one.step <= RECENT), event]
             if not settled and have is not None and event.step >= LOOK * plan.recipe.iterations:
                 settled = True

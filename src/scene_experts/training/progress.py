@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+import torch
 from rich.console import Console
 from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
@@ -17,6 +18,22 @@ from scene_experts.scene import Traits
 from scene_experts.training.events import Densified, Event, Exported, Finished, Previewed, Saved, Started, Stepped, Stopped
 
 SMOOTHING = 0.9  # weight of the previous value in the running means of loss and PSNR
+
+
+GROWN = 1.2
+"""How much more an iteration costs once a scene has grown, in the second half: a whole training
+then takes 1.7 times ten first tenths (`making.budget.GROWTH`)."""
+
+
+def count_left(step: int, total: int) -> float:
+    """Return how many iterations as long as the present one are left. On the CPU those of a growing
+    scene become longer; on CUDA that is not measured, and they count alike."""
+    if torch.cuda.is_available():
+        return total - step
+    grown = lambda share: 1 + GROWN * min(2 * share, 1.0)  # noqa: E731
+    spent = lambda share: share + GROWN * (min(share, 0.5) ** 2 + max(0.0, share - 0.5))  # noqa: E731
+    done = step / total
+    return total * (spent(1.0) - spent(done)) / grown(done)
 
 
 class TrainingProgress:
@@ -109,7 +126,7 @@ class TrainingProgress:
             self.loss[name] = SMOOTHING * self.loss.get(name, value) + (1 - SMOOTHING) * value
         self.psnr = event.psnr if self.psnr is None else SMOOTHING * self.psnr + (1 - SMOOTHING) * event.psnr
         speed = self.pace(event.step)
-        left = "-:-- left" if speed is None else f"{format_duration((self.total - event.step) / speed)} left  {speed:.1f} it/s"
+        left = "-:-- left" if speed is None else f"{format_duration(count_left(event.step, self.total) / speed)} left  {speed:.1f} it/s"
         terms = " ".join(f"{name} {value:.4f}" for name, value in self.loss.items())
         active = f"active {100 * event.active:.0f} %  " if self.traits.activation else ""
         line = (  # a narrow terminal cuts the end off
