@@ -286,6 +286,7 @@ def write_page(folder: Path, options: Options, progress: Progress) -> Path:
     newest = max(path.stat().st_mtime for path in (run / "checkpoints").glob("ckpt_*.safetensors"))
     if page.is_file() and page.stat().st_mtime > newest:
         return page
+    progress("page", 0, 1)
     opened: Any = run_folder.open_run(run)
     written = export_several(opened, ("html",), page, options, tell=progress)
     if not written:
