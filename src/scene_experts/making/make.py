@@ -177,6 +177,7 @@ class TrainingPlan:
     capture: Capture
     recipe: Recipe
     advice: Advice | None = None  # what was estimated
+    slow: float = 1.0  # times that the machine takes of it, as far as known
     begun: bool = False  # by an earlier call
 
     def fit(self, have: float | None, slow: float = 1.0) -> TrainingPlan:
@@ -186,7 +187,14 @@ class TrainingPlan:
         resolution = f"longest:{advice.side}" if advice.side else "auto"
         capture = load_capture(self.place, split=self.split, resolution=resolution)
         chosen = recipe(PROPOSED, iterations=advice.iterations, exposure=self.recipe.exposure)
-        return replace(self, capture=capture, recipe=chosen, advice=advice)
+        return replace(self, capture=capture, recipe=chosen, advice=advice, slow=slow)
+
+    def pays(self, other: TrainingPlan, step: int) -> bool:
+        """Return whether another plan, begun now, ends sooner than this one from `step` on, or is
+        for a machine that is faster than was known."""
+        if other.slow < self.slow or self.advice is None or self.advice.minutes is None or other.advice is None:
+            return True
+        return (other.advice.minutes or 0.0) < self.advice.minutes * (1 - step / self.recipe.iterations)
 
 
 def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Callable[[str], None]) -> TrainingPlan:
@@ -239,8 +247,8 @@ def train(
     """
     settled = plan.begun
     while True:
-        have, slow = budget.for_training(scores), None
-        begun = plan.begun
+        have, other = budget.for_training(scores), None
+        begun, minutes = plan.begun, plan.advice.minutes if plan.advice else None
         trainer = Trainer(plan.recipe, plan.capture, folder, resume=begun, overwrite=not begun, preview_every=0, save_every=SAVE_EVERY)
         recent: list[Stepped] = []
         for event in saved_when_interrupted(trainer):
@@ -250,14 +258,16 @@ def train(
             recent = [*(one for one in recent if event.step - one.step <= RECENT), event]
             if not settled and have is not None and event.step >= LOOK * plan.recipe.iterations:
                 settled = True
-                slow = find_slowness(plan.recipe.iterations, event.step, event.seconds, plan.advice.minutes if plan.advice else None, have)
-                if slow is not None:
+                slow = find_slowness(plan.recipe.iterations, event.step, event.seconds, minutes, have)
+                other = None if slow is None else plan.fit(budget.for_training(scores), slow)
+                if other and plan.pays(other, event.step):
                     trainer.stop("another training fits the time")
-        if slow is None:
+                else:
+                    other = None
+        if other is None:
             break
-        plan = plan.fit(budget.for_training(scores), slow)
-        how = "slower" if slow > 1 else "faster"
-        now = f"{plan.recipe.iterations:,} iterations, {plan.capture.data.resolution}"
+        how = "slower" if other.slow > plan.slow else "faster"
+        plan, now = other, f"{other.recipe.iterations:,} iterations, {other.capture.data.resolution}"
         say(f"the machine is {how} than estimated: the training begins anew, {now}")
     psnr = fmean(one.psnr for one in recent) if recent else None
     return trainer.run, psnr

@@ -11,7 +11,7 @@ from scene_experts.bench.advice import Advice
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
 from scene_experts.making import make as making
-from scene_experts.making.make import make
+from scene_experts.making.make import TrainingPlan, make
 from scene_experts.sfm.options import SfmOptions, SourceOptions
 from scene_experts.training.events import Stepped
 from scene_experts.training.recipes import PROPOSED
@@ -63,7 +63,11 @@ def trained(monkeypatch):
     monkeypatch.setattr(making, "Trainer", Trainer)
     monkeypatch.setattr(making, "export_several", export)
     monkeypatch.setattr(making.run_folder, "open_run", lambda folder: None)
-    plan = lambda width, height, views, have, slow=1.0: Advice(0, 1000 if have is None or slow == 1 else round(have / slow * 10), 1.0)  # noqa: E731
+
+    def plan(width, height, views, have, slow=1.0):
+        iterations = 1000 if have is None or slow == 1 else round(have / slow * 10)
+        return Advice(0, iterations, iterations / 1000)
+
     monkeypatch.setattr(making, "plan_training", plan)
     monkeypatch.setattr(making, "measure_share", lambda threads: 1.0)
     return SimpleNamespace(made=made, Trainer=Trainer)
@@ -94,6 +98,13 @@ def test_a_training_that_would_not_fit_begins_anew_with_other_iterations(capture
     first, second = trained.made
     assert first.stopped and not second.stopped
     assert second.recipe.iterations == pytest.approx(75 / (170 / 60) * 10, rel=0.02)  # 15 of 90 s are the page's; 170 s for 1 min
+
+
+def test_a_training_is_not_begun_anew_for_one_that_ends_later(capture, tmp_path):
+    whole = TrainingPlan(tmp_path, "none", (48, 32), None, SimpleNamespace(iterations=320), Advice(0, 320, 0.32))
+    shortest = replace(whole, advice=Advice(0, 300, 0.3), slow=4.0)
+    assert not whole.pays(shortest, 32) and whole.pays(shortest, 10)
+    assert whole.pays(replace(shortest, advice=Advice(0, 900, 0.9), slow=0.5), 32)
 
 
 def test_a_repeated_call_continues_the_training_and_keeps_the_page(capture, tmp_path, trained, monkeypatch):
