@@ -15,7 +15,7 @@ from torch import Tensor
 
 from scene_experts.core.errors import InputError
 from scene_experts.data.views import Capture, World
-from scene_experts.evaluate.metrics import psnr
+from scene_experts.evaluate.metrics import LEAST_MSE
 from scene_experts.files.anchors.data import AnchorData
 from scene_experts.files.anchors.precision import Precision
 from scene_experts.files.anchors.read import scene as scene_of
@@ -33,6 +33,7 @@ from scene_experts.training.run_folder import OpenRun
 from scene_experts.training.sensitivity import MOST_VIEWS, evenly
 
 VIEWS = 16  # that judge a precision
+FEW = 4  # of them, that find about where it lies
 START = -40.0  # first guess of log2 of the mean square error that every value adds
 ROUNDS = 10
 UNKNOWN_ERROR = 10**-3.2  # mean square error of pictures without photographs: that of 32 dB
@@ -66,34 +67,45 @@ class Judge:
         return Painter.of(scene, step, self.rasterize, self.run.config.train.antialias)
 
     @cached_property
-    @torch.no_grad()
-    def _before(self) -> list[tuple[Tensor, float]]:
-        """By view: the run's picture as bytes, and its mean square error."""
-        painter, background, out = self._painter(self.run.scene, self.run.step), torch.tensor(self.capture.background), []
-        for index in self.views:
-            image = painter.picture_8bit(self.capture.views[index].camera, background)
-            out.append(((image * 255).round().to(torch.uint8), self._error(index, image)))
-        return out
+    def _own(self) -> tuple[Painter, dict[int, tuple[Tensor, float]]]:
+        """What draws the run, and what it has drawn: see `_before`."""
+        return self._painter(self.run.scene, self.run.step), {}
+
+    def _before(self, index: int) -> tuple[Tensor, float]:
+        """The run's picture of a view as bytes, and its mean square error."""
+        painter, drawn = self._own
+        if index not in drawn:
+            image = painter.picture_8bit(self.capture.views[index].camera, torch.tensor(self.capture.background))
+            drawn[index] = (image * 255).round().to(torch.uint8), self._error(index, image)
+        return drawn[index]
 
     def _error(self, index: int, image: Tensor) -> float:
         if not self.has_photographs:
             return UNKNOWN_ERROR
         frame = self.capture.frame(index)
         image = self.run.scene.as_photographed(image, self.capture.views[index].camera)
-        return 10 ** (-0.1 * psnr(image, frame.rgb.float() / 255, frame.mask))
+        return max(_mean_square(image, frame.rgb.float() / 255, frame.mask), LEAST_MSE)
 
     @torch.no_grad()
-    def loss(self, contents: AnchorData) -> float:
-        """What contents lose against the run, dB: the mean over the views. Of a scene whose errors a
-        rounding happens to mend, it is what the difference between the pictures would cost."""
-        painter, total = self._painter(*scene_of(self.run, contents, self.world)), 0.0
+    def loss(self, contents: AnchorData, most: int = VIEWS) -> float:
+        """What contents lose against the run, dB: the mean over at most `most` of the views. Of a
+        scene whose errors a rounding happens to mend, it is what the difference between the
+        pictures would cost."""
+        painter, total, views = self._painter(*scene_of(self.run, contents, self.world)), 0.0, evenly(self.views, most)
         background = torch.tensor(self.capture.background)
-        for index, (own, error) in zip(self.views, self._before):
+        for index in views:
+            own, error = self._before(index)
             image = painter.picture_8bit(self.capture.views[index].camera, background)
-            away = float((image - own.float() / 255).double().square().mean())
+            away = _mean_square(image, own.float() / 255)
             after = max(error + away, self._error(index, image) if self.has_photographs else 0.0)
             total += max(10 * math.log10(after / error), 10 * math.log10(1 + away / WORST_ERROR))
-        return total / len(self.views)
+        return total / len(views)
+
+
+def _mean_square(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """The mean square difference of two pictures, in single precision."""
+    squared = (image - target).square()
+    return float(squared.mean() if mask is None else (squared * mask[..., None]).sum() / (3 * mask.sum()))
 
 
 def _shows(capture: Capture, index: int) -> bool:
@@ -177,8 +189,8 @@ def choose_precision(
         judge = Judge(run, world.seen_from(origin_of(run, world)), views, rasterize)
 
         @cache
-        def loss(at: float) -> float:
-            return judge.loss(rounded(contents, unit.at(2.0**at)))
+        def loss(at: float, most: int = VIEWS) -> float:
+            return judge.loss(rounded(contents, unit.at(2.0**at)), most)
 
         if options.target_mb:
             wanted = options.target_mb * MEGABYTE
@@ -190,7 +202,8 @@ def choose_precision(
                 )
             at = -place
         else:
-            found = search(loss, quality, START, 1.0, 0.85)
+            start = search(lambda at: loss(at, FEW), quality, START, 1.0, 0.85) if len(judge.views) > 2 * FEW else None
+            found = search(loss, quality, START if start is None else start, 1.0, 0.85)
             at = START - 30 if found is None else found
         lost, against = loss(at), "" if judge.has_photographs else " (estimated, without photographs)"
         also = "; values have the steps that the training learned" if unit.learned else ""
