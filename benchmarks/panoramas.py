@@ -3,11 +3,12 @@
     python benchmarks/panoramas.py RUN --out OUT [--places 24] [--width 2048]
 
 Panoramas are drawn at the places of evenly chosen training cameras, upright, their middles where
-these cameras look: six square pictures of 90 degrees, resampled to 2:1 (four samples a pixel). OUT
-gets `panoramas`, `capture` (of `scene-experts capture`, one thread) and `direct`: the same views
-with the same lens, drawn by the scene from the true places and directions, in a capture with the
-same points. Prints how many views have a pose, and how far the places and directions are from the
-true ones after a similarity transform. `scene-experts train` of both captures then tells what
+these cameras look. They are sampled from 56 pictures of 44 degrees each: six faces of a cube do not
+meet, because the near plane and the shape of a splat depend on the axis. OUT gets `panoramas`,
+`capture` (of `scene-experts capture`, one thread) and `direct`: the same views with the same lens,
+sampled from the same pictures, with their true poses, in a capture with the same points. Prints how
+many views have a pose, and how far the places and directions are from the true ones after a
+similarity transform. `scene-experts train` of both captures then tells what
 panoramas cost.
 """
 
@@ -27,15 +28,13 @@ from PIL import Image
 from torch.nn import functional
 
 import scene_experts as se
-from scene_experts.data.equirectangular import FIELD, VIEWS, find_place, view_side
+from scene_experts.data.equirectangular import FIELD, VIEWS, PanoramaView, find_place, view_side
 from scene_experts.data.readers.colmap_model import find_models, read_model, write_model
 from scene_experts.geometry.rotation import matrix_to_quat, quat_to_matrix
 
-FACES = [np.eye(3)[:, order] * signs for order, signs in (
-    ([0, 1, 2], (1, 1, 1)), ([2, 1, 0], (-1, 1, 1)), ([0, 1, 2], (-1, 1, -1)), ([2, 1, 0], (1, 1, -1)),
-    ([0, 2, 1], (1, 1, -1)), ([0, 2, 1], (1, -1, 1)),
-)]  # fmt: skip
-"""Rotations [3, 3] from the axes of a face to those of the panorama: ahead, right, behind, left, up, down."""
+TILE = 44  # degrees
+ROWS = ((75, 6), (45, 10), (15, 12), (-15, 12), (-45, 10), (-75, 6))
+TILES = [PanoramaView(round(360 * k / count), pitch) for pitch, count in ROWS for k in range(count)]
 PARTS = {view.folder: view.rig_from_view for view in VIEWS}
 
 
@@ -51,29 +50,49 @@ def choose_places(run: se.Run, count: int) -> list[tuple[np.ndarray, np.ndarray]
     return chosen
 
 
-def draw(run: se.Run, centre: np.ndarray, turn: np.ndarray, side: int) -> np.ndarray:
-    """Return the square picture [side, side, 3] of FIELD degrees; turn: camera to world."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn, centre
-    focal = side / 2 / np.tan(np.radians(FIELD / 2))
-    return run.render(se.Camera.from_pose(pose, width=side, height=side, fx=focal, cx=side / 2, cy=side / 2))
+def find_rays(turn: np.ndarray, side: int) -> torch.Tensor:
+    """Return the rays [side, side, 3] of a view of FIELD degrees; turn: from its axes."""
+    across = ((torch.arange(side) + 0.5) / (side / 2) - 1) * float(np.tan(np.radians(FIELD / 2)))
+    y, x = torch.meshgrid(across, across, indexing="ij")
+    return torch.stack([x, y, torch.ones_like(x)], -1) @ torch.from_numpy(turn).float().T
 
 
-def draw_panorama(run: se.Run, centre: np.ndarray, turn: np.ndarray, width: int, fine: int = 2) -> np.ndarray:
-    """Return the panorama [width / 2, width, 3] float32; fine: samples a pixel and axis."""
-    lon = ((torch.arange(width * fine) + 0.5) / (width * fine) - 0.5) * 2 * torch.pi
-    lat = (0.5 - (torch.arange(width * fine // 2) + 0.5) / (width * fine // 2)) * torch.pi
+def find_panorama_rays(width: int) -> torch.Tensor:
+    """Return the rays [width / 2, width, 3] of a panorama."""
+    lon = ((torch.arange(width) + 0.5) / width - 0.5) * 2 * torch.pi
+    lat = (0.5 - (torch.arange(width // 2) + 0.5) / (width // 2)) * torch.pi
     lat, lon = torch.meshgrid(lat, lon, indexing="ij")
-    rays = torch.stack([lon.sin() * lat.cos(), -lat.sin(), lon.cos() * lat.cos()], -1)
-    local = torch.stack([rays @ torch.from_numpy(face).float() for face in FACES])
-    owner = local[..., 2].argmax(0)
-    out = torch.zeros(*rays.shape)
-    for k, face in enumerate(FACES):
-        picture = torch.from_numpy(draw(run, centre, turn @ face, int(width * 0.45)))
-        grid = (local[k, ..., :2] / local[k, ..., 2:].clamp_min(1e-6))[None]
-        drawn = functional.grid_sample(picture.permute(2, 0, 1)[None], grid, "bicubic", "border", align_corners=False)[0]
-        out[owner == k] = drawn.permute(1, 2, 0)[owner == k]
-    return functional.avg_pool2d(out.permute(2, 0, 1)[None], fine)[0].permute(1, 2, 0).numpy()
+    return torch.stack([lon.sin() * lat.cos(), -lat.sin(), lon.cos() * lat.cos()], -1)
+
+
+class TiledPicture:
+    """A picture that is sampled from narrow ones around one place."""
+
+    def __init__(self, rays: torch.Tensor) -> None:
+        self.shape, flat = rays.shape, rays.reshape(-1, 3)
+        owner = torch.stack([flat @ torch.from_numpy(tile.rig_from_view[:, 2]).float() for tile in TILES]).argmax(0)
+        self.places = [(owner == k).nonzero()[:, 0] for k in range(len(TILES))]
+        local = [flat[at] @ torch.from_numpy(tile.rig_from_view).float() for at, tile in zip(self.places, TILES)]
+        self.grids = [(rays[:, :2] / rays[:, 2:] / float(np.tan(np.radians(TILE / 2))))[None, None] for rays in local]
+
+    def sample(self, tiles: list[torch.Tensor]) -> np.ndarray:
+        out = torch.zeros(self.shape).reshape(-1, 3)
+        for tile, at, grid in zip(tiles, self.places, self.grids):
+            if len(at):
+                out[at] = functional.grid_sample(tile[None], grid, "bicubic", "border", align_corners=False)[0, :, 0].T
+        return out.reshape(self.shape).numpy()
+
+
+def draw_tiles(run: se.Run, centre: np.ndarray, turn: np.ndarray, width: int) -> list[torch.Tensor]:
+    """Return pictures [3, side, side] all around a place, a little finer than a panorama of `width` pixels."""
+    found, side = [], round(0.36 * width * np.tan(np.radians(TILE / 2)))
+    focal = side / 2 / np.tan(np.radians(TILE / 2))
+    for tile in TILES:
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn @ tile.rig_from_view, centre
+        camera = se.Camera.from_pose(pose, width=side, height=side, fx=focal, cx=side / 2, cy=side / 2)
+        found.append(torch.from_numpy(run.render(camera)).permute(2, 0, 1))
+    return found
 
 
 def save(picture: np.ndarray, path: Path) -> None:
@@ -90,9 +109,9 @@ def align(found: torch.Tensor, true: torch.Tensor) -> tuple[float, torch.Tensor,
     return scale, turn, true.mean(0) - scale * turn @ found.mean(0)
 
 
-def place_truly(capture: Path, direct: Path, places: dict[str, tuple[np.ndarray, np.ndarray]]) -> list[str]:
+def place_truly(capture: Path, direct: Path, places: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
     """Write the capture `direct`: the points of `capture` in the frame of the true places, and the
-    true poses. Returns the views with a pose."""
+    true poses."""
     model = read_model(find_models(capture)[0])
     turns = [quat_to_matrix(torch.tensor(image.quaternion, dtype=torch.float64)[None])[0] for image in model.images]
     centres = torch.stack([-R.T @ torch.tensor(image.translation, dtype=torch.float64) for R, image in zip(turns, model.images)])
@@ -114,7 +133,6 @@ def place_truly(capture: Path, direct: Path, places: dict[str, tuple[np.ndarray,
     print(f"poses: {len(images)} of {len(VIEWS) * len(places)} views, {len(set(keys))} of {len(places)} places")
     print(f"places off: median {100 * float(off.median()) / spread:.4f}, most {100 * float(off.max()) / spread:.4f} % of the extent")
     print(f"directions off: median {np.median(angles):.4f}, most {max(angles):.4f} degrees")
-    return [image.name for image in images]
 
 
 def main() -> None:
@@ -127,19 +145,21 @@ def main() -> None:
     torch.set_num_threads(1)
     run = se.open_run(asked.run)
     places = {f"place{k:02d}": place for k, place in enumerate(choose_places(run, asked.places))}
+    whole = TiledPicture(find_panorama_rays(asked.width))
+    views = {folder: TiledPicture(find_rays(turn, view_side(asked.width))) for folder, turn in PARTS.items()}
     for name, (centre, turn) in places.items():
-        if not (asked.out / f"panoramas/{name}.jpg").is_file():
-            save(draw_panorama(run, centre, turn, asked.width), asked.out / f"panoramas/{name}.jpg")
+        tiles = draw_tiles(run, centre, turn, asked.width)
+        save(whole.sample(tiles), asked.out / f"panoramas/{name}.jpg")
+        for folder, view in views.items():
+            save(view.sample(tiles), asked.out / f"direct/images/{folder}/{name}.jpg")
         print("drawn:", name, flush=True)
     capture, direct = asked.out / "capture", asked.out / "direct"
     words = ["capture", str(asked.out / "panoramas"), "--out", str(capture), "--threads", "1"]
     process = subprocess.Popen([sys.executable, "-m", "scene_experts", *words])
     usage = os.wait4(process.pid, 0)[2]
     print(f"capture: {usage.ru_utime + usage.ru_stime:.0f} CPU s", flush=True)
-    shutil.copytree(capture, direct, ignore=shutil.ignore_patterns("images", "sparse", "*.db", "sfm"), dirs_exist_ok=True)
-    for name in place_truly(capture, direct, places):
-        centre, turn = places[find_place(name).removesuffix(".jpg")]
-        save(draw(run, centre, turn @ PARTS[name.split("/")[0]], view_side(asked.width)), direct / "images" / name)
+    place_truly(capture, direct, places)
+    shutil.copyfile(find_models(capture)[0] / "test.txt", direct / "sparse/0/test.txt")
 
 
 if __name__ == "__main__":
