@@ -36,14 +36,15 @@ class Film:
     def write(self, out: Path, rasterize: Rasterizer, device: str, progress: Progress) -> int:
         """Write a video, or PNG files if `out` is a folder, and return the number of frames. A folder
         that shows depth has the first run's as float32 too: along the camera's axis, in the
-        capture's unit, 0 where nothing is drawn.
+        capture's unit, 0 where nothing is drawn. Its frames.json has the names of the photographs
+        that --path test draws.
 
         Raises InputError if a video is impossible, RunError if the encoder fails or the disk is
         full.
         """
         if not video.is_video(out):
             depths = partial(self.draw_depth, rasterize, device) if "depth" in self.options.show else None
-            return video.write_pictures(out, self.draw_frames(rasterize, device, progress), depths)
+            return video.write_pictures(out, self.draw_frames(rasterize, device, progress), depths, self.path.names)
         video.import_ffmpeg()  # reports a missing package before the first frame is drawn
         self.expect_one_size()
         return video.write_video(out, self.draw_frames(rasterize, device, progress), self.path.fps, self.options.quality)
@@ -118,7 +119,9 @@ def make_path(options: FilmOptions, capture: Capture) -> CameraPath:
     fps = options.fps or 24.0
     if options.path == "test":
         chosen = capture.test or capture.train
-        return CameraPath(tuple(resize_camera(capture.views[i].camera, size) for i in chosen), options.fps or 2.0)
+        views = [capture.views[i] for i in chosen]
+        cameras, names = tuple(resize_camera(view.camera, size) for view in views), tuple(view.name for view in views)
+        return CameraPath(cameras, options.fps or 2.0, names)
     return paths.make_path(options.path, capture, options.frames or max(1, round(options.seconds * fps)), size, fps)
 
 

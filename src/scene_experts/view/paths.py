@@ -31,6 +31,8 @@ class CameraPath:
 
     cameras: tuple[Camera, ...]
     fps: float = 24.0
+    names: tuple[str, ...] = ()
+    """The photograph of each camera; none for a path between photographs."""
 
     def __len__(self) -> int:
         return len(self.cameras)

@@ -3,7 +3,7 @@ installs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -75,9 +75,12 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float, quality: i
     return count
 
 
-def write_pictures(folder: Path, frames: Iterable[np.ndarray], floats: Callable[[int], np.ndarray] | None = None) -> int:
+def write_pictures(
+    folder: Path, frames: Iterable[np.ndarray], floats: Callable[[int], np.ndarray] | None = None, names: Sequence[str] = ()
+) -> int:
     """Write frames as 00000.png, 00001.png, ... and their number as frames.json, and return their
-    number. floats: Returns values [H, W] of a frame, which are written as 00000.tiff.
+    number. floats: Returns values [H, W] of a frame, which are written as 00000.tiff. names: The
+    photograph of each frame, for frames.json.
 
     Frames that an earlier call wrote into the folder are replaced. Raises InputError, before the
     first frame is drawn, if the folder holds such pictures from elsewhere.
@@ -103,7 +106,7 @@ def write_pictures(folder: Path, frames: Iterable[np.ndarray], floats: Callable[
             (folder / f"{name}.png").unlink(missing_ok=True)
         if had_floats and (number >= count or floats is None):
             (folder / f"{name}.tiff").unlink(missing_ok=True)
-    write_json(note, {"frames": count, "floats": floats is not None})
+    write_json(note, {"frames": count, "floats": floats is not None, **({"photographs": list(names)} if names else {})})
     return count
 
 

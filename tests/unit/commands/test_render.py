@@ -48,7 +48,7 @@ def test_views_of_several_sizes_are_no_video(run, tmp_path):
     assert cli.main([*args, str(tmp_path / "x.mp4"), "--size", "48x32"]) == 0 and (tmp_path / "x.mp4").stat().st_size > 0
 
 
-def test_depth_in_a_folder_is_that_of_the_layers(run, tmp_path):
+def test_depth_in_a_folder_is_that_of_the_layers_and_of_named_photographs(run, tmp_path):
     args = ["render", str(run), "--path", "test", "--show", "depth", "--out", str(tmp_path)]
     assert cli.main(args) == 0
     opened = se.open_run(run)
@@ -56,6 +56,8 @@ def test_depth_in_a_folder_is_that_of_the_layers(run, tmp_path):
     with Image.open(tmp_path / "00000.tiff") as found:
         assert np.allclose(np.array(found), layers.depth, rtol=1e-5)
     assert layers.depth.max() > 0
+    held = [opened.capture.names[i] for i in opened.capture.loaded.test]
+    assert json.loads((tmp_path / "frames.json").read_text())["photographs"] == held
 
 
 def test_the_held_out_views_beside_another_run(run, tmp_path):

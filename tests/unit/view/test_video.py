@@ -1,5 +1,7 @@
 """Frames on disk: exact pictures, and a video that can be read back."""
 
+import json
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -49,7 +51,8 @@ def test_floats_lie_beside_the_pictures_and_go_with_them(tmp_path):
         assert found.mode == "F" and np.array_equal(np.array(found), depth(2))
     video.write_pictures(tmp_path, frames(2), depth)
     assert sorted(path.name for path in tmp_path.glob("*.tiff")) == ["00000.tiff", "00001.tiff"]
-    video.write_pictures(tmp_path, frames(2))
+    video.write_pictures(tmp_path, frames(2), names=("a.jpg", "b.jpg"))
+    assert json.loads((tmp_path / "frames.json").read_text()) == {"frames": 2, "floats": False, "photographs": ["a.jpg", "b.jpg"]}
     assert not list(tmp_path.glob("*.tiff"))
     (tmp_path / "00001.tiff").write_bytes(b"a scan")
     video.write_pictures(tmp_path, frames(1))

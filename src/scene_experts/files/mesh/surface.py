@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from scene_experts.files.mesh.fuse import SIDE, DepthView, Points, Volume, sample
 
@@ -112,7 +113,8 @@ def leave_out_small(vertices: Points, faces: NDArray[np.int64], smallest: float 
 
 def colour(vertices: Points, views: Sequence[DepthView], voxel: float) -> NDArray[np.uint8]:
     """Return the colour [V, 3] of each vertex: the mean over the views that see it, weighted by the
-    inverse square of the distance; grey where none does."""
+    inverse square of the distance. Where none does: that of the nearest vertex that one sees, or
+    grey."""
     total, weight = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
     for view in views:
         camera = view.camera
@@ -125,5 +127,7 @@ def colour(vertices: Points, views: Sequence[DepthView], voxel: float) -> NDArra
         row = np.clip((K[1, 1] * y / z + K[1, 2]).astype(np.int64), 0, view.color.shape[0] - 1)
         total[seen] += view.color[row, column] / (z * z)[:, None]
         weight[seen] += 1 / (z * z)
-    mean = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-30)[:, None], 0.5)
+    mean, known = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-30)[:, None], 0.5), weight > 0
+    if known.any() and not known.all():
+        mean[~known] = mean[known][KDTree(vertices[known]).query(vertices[~known])[1]]
     return np.rint(255 * mean.clip(0, 1)).astype(np.uint8)

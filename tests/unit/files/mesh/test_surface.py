@@ -58,3 +58,4 @@ def test_vertices_have_the_colour_that_views_see_there(sphere):
     assert (colour(vertices, views, VOXEL) == 64).mean() > 0.98
     unseen = np.array([[0.0, 0.0, 0.0]])
     assert (colour(unseen, views, VOXEL) == 128).all()
+    assert (colour(np.concatenate([vertices, unseen]), views, VOXEL)[-1] == 64).all()
