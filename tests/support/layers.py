@@ -11,7 +11,7 @@ from scene_experts.core.reading import budget
 from scene_experts.core.reading.source import opening
 from scene_experts.files.anchors import compact
 from scene_experts.files.anchors.data import AnchorData
-from scene_experts.files.anchors.layers import Layers, LayeredScene, encode
+from scene_experts.files.anchors.layers import LayeredScene, Layers, encode
 
 
 def make_coarse(data: AnchorData, share: float = 0.4, seed: int = 0) -> tuple[torch.Tensor, AnchorData]:

@@ -116,6 +116,7 @@ export class Gpu {
   constructor(device) {
     this.device = device;
     this.bytes = 0;
+    this.made = []; // buffers
     this.errors = [];
     device.addEventListener("uncapturederror", (event) => this.errors.push(event.error.message));
   }
@@ -124,6 +125,13 @@ export class Gpu {
     const made = this.device.createBuffer({ size: bytes, usage: usage | also });
     if (data) this.device.queue.writeBuffer(made, 0, data);
     this.bytes += bytes;
+    this.made.push(made);
+    return made;
+  }
+  // The buffers so far, which the caller will destroy.
+  release() {
+    const { made } = this;
+    Object.assign(this, { made: [], bytes: 0 });
     return made;
   }
   bind(pipeline, resources) {

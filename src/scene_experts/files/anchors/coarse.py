@@ -7,11 +7,9 @@ networks, the classes and the places of the anchors stay.
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -37,14 +35,15 @@ from scene_experts.training.sensitivity import evenly
 from scene_experts.view.filled import find_first_views, small
 
 SHARE = 0.125  # of the bytes of the whole scene
-SHIFTS = {"feature": 4, "log_scaling": 4, "offsets": 4}
+SHIFTS = {"feature": 5, "log_scaling": 4, "offsets": 4}
 """Binary logarithms of the steps, in those of the whole scene."""
 ITERATIONS = 500
 VIEWS, SIDE = 64, 360  # training views that it is fitted to; px of their shorter side, at most
 FIRST = 4  # every so many iterations see a first view
-WEIGHT, LOOK, MOST_CHANGE = 0.006, 50, 2.0  # of the bits at first; iterations after which it follows the size, by this factor at most
-BEGIN = 1.15  # times the size, at which the fit begins
+WEIGHT, LOOK, MOST_CHANGE = 0.003, 50, 2.0  # of the bits at first; iterations after which it follows the size, by this factor at most
+BEGIN = 1.05  # times the size, at which the fit begins
 DSSIM = 0.2
+ROUNDS = 5  # of the search for the slots at first
 LEAST = 64  # anchors, without which a scene has no coarse one
 _RATES = {"feature": Rate(0.01, 0.001), "offsets": Rate(0.005, 0.0005), "log_scaling": Rate(0.007, 0.0007)}
 _OPEN, _CLOSED = 1.0, -1.0  # logits of masks at first
@@ -110,7 +109,7 @@ def make_layers(run: OpenRun, data: AnchorData, world: World, capture: Capture, 
     kept = _choose(data, pictures.given(pictures.views + pictures.first, N * K), target)
     if int(kept.any(1).sum()) < LEAST:
         rows = torch.arange(N)
-        return Layered(data, rows, _coarse(data, rows, kept.any(1, keepdim=True) | True & torch.ones(N, K, dtype=torch.bool)), given)
+        return Layered(data, rows, _coarse(data, rows, torch.ones(N, K, dtype=torch.bool)), given)
     scene = _begin(whole, data, kept, world.scale)
     _fit(scene, step, run, pictures, lambda: compact.encode(_settle(scene, data))[1].total / target, tell)
     coarse, rows = _settle(scene, data), scene.table.facts["row"][(scene.table.params[KEEP] > 0).any(1)]
@@ -150,7 +149,7 @@ def _choose(data: AnchorData, given: Tensor, target: float) -> Tensor:
     N, K = data.columns["offsets"].shape[:2]
     order = given.argsort(descending=True)
     low, high, kept = 0, int((given > 0).sum()), torch.zeros(N * K, dtype=torch.bool)
-    for _ in range(6):
+    for _ in range(ROUNDS):
         middle = (low + high + 1) // 2
         chosen = torch.zeros(N * K, dtype=torch.bool)
         chosen[order[:middle]] = True
@@ -168,9 +167,6 @@ def _begin(whole: AnchorScene, data: AnchorData, kept: Tensor, scale: float) -> 
     rows, table = kept.any(1).nonzero().squeeze(1), whole.table
     params = {name: value.detach()[rows].clone() for name, value in table.params.items()}
     scene = whole.with_table(Table(params, {**{name: value[rows] for name, value in table.facts.items()}, "row": rows}))
-    scene = copy.copy(scene)
-    scene._modules = {**scene._modules, "heads": copy.deepcopy(whole._modules["heads"])}
-    scene.heads = scene._modules["heads"]  # type: ignore[assignment]
     steps = _coarse_steps(data)
     scene.start_rounding(torch.cat([steps[name] for name in ROUNDED]), _precision(data).classes[rows], scale)
     with torch.no_grad():
@@ -187,7 +183,7 @@ def _settle(scene: AnchorScene, data: AnchorData) -> AnchorData:
     return _coarse(data, scene.table.facts["row"][opened], table.facts["slots"], values)
 
 
-def _fit(scene: AnchorScene, step: int, run: OpenRun, pictures: _Pictures, size: Any, tell: Tell) -> None:
+def _fit(scene: AnchorScene, step: int, run: OpenRun, pictures: _Pictures, size: Callable[[], float], tell: Tell) -> None:
     """Move the values and masks of the scene until its pictures are those that are wanted. size():
     of its file, in that which it should have."""
     term = RateTerm(WEIGHT, 0, run.config.train.growth, ITERATIONS)

@@ -106,6 +106,14 @@ def scene_in(page: bytes) -> bytes:
         raise Damaged("a scene that is not base64") from None
 
 
+def settings_in(page: bytes) -> bytes:
+    """The text of the settings in a page. Raises CutShort for a page without them."""
+    content = _script(page, _SETTINGS)
+    if content is None:
+        raise CutShort("no settings")
+    return content
+
+
 def unit_of(splats: Splats) -> float:
     """The factor by which the page multiplies lengths: 1 where SPZ holds every size and position,
     else the power of two that brings the median size to the middle of its range, without a position

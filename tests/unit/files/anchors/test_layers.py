@@ -68,7 +68,7 @@ def test_chunks_of_the_first_view_come_first_and_refine_their_part_of_the_curve(
 
 def test_damaged_layers_are_refused(tmp_path):
     made, other = make_layers(make_scene(120)), make_layers(make_scene(120, seed=3))
-    with pytest.raises(InputError, match="coarse.compact"):
+    with pytest.raises(InputError, match=r"coarse\.compact"):
         open_layers(tmp_path, made, other.plan)
     for broken in (made.plan[:-9], made.plan[:60] + b"x" + made.plan[61:], b""):
         with pytest.raises(InputError):
@@ -91,8 +91,8 @@ import {{ readCompact }} from {json.dumps((ROOT / "integrations/javascript/compa
 import {{ LayeredScene }} from {json.dumps((ROOT / "integrations/javascript/layers.mjs").as_uri())};
 const out = [], bytes = (path) => new Uint8Array(readFileSync(path));
 for (const folder of process.argv.slice(2)) {{
-  const scene = await LayeredScene.open(await readCompact(bytes(folder + "/coarse")), bytes(folder + "/plan")), counts = [scene.scene().header.N];
-  let said = "";
+  const scene = await LayeredScene.open(await readCompact(bytes(folder + "/coarse")), bytes(folder + "/plan"));
+  let counts = [scene.scene().header.N], said = "";
   for (let i = 0; i < scene.total; ++i) {{
     try {{ scene.take(bytes(folder + "/" + i)); }} catch (error) {{ said = error.message; break; }}
     const now = scene.scene();
