@@ -19,7 +19,7 @@ from torch import Tensor
 
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.source import opening
-from scene_experts.files.anchors import compact, layers, streamed
+from scene_experts.files.anchors import compact, layers
 from scene_experts.files.anchors.data import AnchorData
 from scene_experts.files.anchors.read import scene as scene_of
 from scene_experts.files.formats import html
