@@ -89,24 +89,25 @@ async function load(page) {
   await page.open(true);
   say("");
   tell = makeLine();
-  page.parts = 0; // that are shown, without the coarse scene and the plan
-  let planned = false;
+  page.parts = 0; // chunks that are shown
+  let planned = false, taken = 0;
   const goOn = async () => {
     try {
       came(0);
       if (!planned) await ask("plan", { bytes: await fetchPart(parts[1]) });
       planned = true;
-      for (let arrived = [], i = 2 + page.parts; i < parts.length; ) {
+      for (let arrived = [], i = 2 + taken; i < parts.length; ) {
         if (!arrived.length) arrived = [fetchPart(parts[i])];
         const bytes = await arrived.shift();
         if (i + 1 < parts.length) arrived.push(fetchPart(parts[i + 1])); // while this one is decoded
         arrived.forEach((promise) => promise.catch(() => {}));
         await ask("chunk", { bytes });
-        page.parts += 1;
         i += 1;
+        taken += 1;
         await ask("show");
         await page.renderer?.refresh(ask, () => page.view());
         page.wake();
+        page.parts = taken;
       }
       tell("");
     } catch (error) {
