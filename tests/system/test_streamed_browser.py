@@ -61,6 +61,7 @@ def serving(folder):
 def write(folder, monkeypatch, case="octree-gs"):
     """A page of four chunks or more. Returns the whole scene and the coarse one, as `picture` draws them."""
     monkeypatch.setattr(layers, "ANCHORS", 40)
+    (folder / "favicon.ico").touch()  # browsers ask servers for it
     run = make_run(case)
     data = contents_of(run)
     data = replace(data, precision=from_spread(data.columns, data.networks))
