@@ -26,7 +26,8 @@ from scene_experts.render import choose
 from scene_experts.training import memory
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Densified
-from scene_experts.training.loop import Job, iterate, train
+from scene_experts.training.job import Job
+from scene_experts.training.loop import iterate, train
 from scene_experts.training.options import TrainOptions
 from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training

@@ -37,7 +37,8 @@ from scene_experts.render import choose
 from scene_experts.training import shards
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Densified
-from scene_experts.training.loop import Job, train
+from scene_experts.training.job import Job
+from scene_experts.training.loop import train
 from scene_experts.training.memory import forget_peak, peak_bytes, reuse_freed, used_bytes
 from scene_experts.training.options import TrainOptions
 from scene_experts.training.recipes import RECIPES

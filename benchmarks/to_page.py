@@ -5,8 +5,9 @@
 Each PHOTOS (a folder or a video) is made into a page in a new folder. CPU seconds are those of all
 processes. --python repeats each with another checkout, in turn with this one: what else the machine
 does meets both alike; one from before `make` runs `capture`, the training that its `info` proposes
-and `export`. --scores holds out every 8th photograph and scores the run; what the page loses
-against the run is what `export` says.
+and `export`. --scores holds out every 8th photograph, scores the run and, after the clock is
+stopped, its page; a checkout from before `make` has a page that was baked, of which the run's scores
+are an upper bound.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from pathlib import Path
 from typing import Any
 
 ONE = """
-import json, resource, sys, time
+import json, re, resource, subprocess, sys, time
+from pathlib import Path
+
 import scene_experts as se
 
 def cpu():
@@ -36,9 +39,6 @@ def progress(what, done, total):
         marks.append((name, time.monotonic(), cpu()))
 
 if not hasattr(se, "make"):
-    import re, subprocess
-    from pathlib import Path
-
     def call(name, *words):
         marks.append((name, time.monotonic(), cpu()))
         done = subprocess.run([sys.executable, "-m", "scene_experts", *words], check=True, stdout=subprocess.PIPE, text=True)
@@ -73,9 +73,15 @@ made = se.make(photos, out, minutes=minutes, scores=scores, say=lambda line: pri
 ends = [began, *marks, ("end", time.monotonic(), cpu())]
 stages = [(a[0], b[1] - a[1], b[2] - a[2]) for a, b in zip(ends, ends[1:])]
 run = made.run / "results.json"
+page = None
+if scores:
+    again = ["export", str(made.run), "--format", "html", "--out", f"{out}/measured.html"]
+    told = subprocess.run([sys.executable, "-m", "scene_experts", *again], check=True, stdout=subprocess.PIPE, text=True).stdout
+    page = float(re.search(r"this file ([0-9.]+) dB", told).group(1))
 print(json.dumps({
     "stages": stages, "seconds": made.seconds, "psnr": made.psnr, "bytes": made.page.stat().st_size,
     "scores": json.loads(run.read_text()) if scores and run.is_file() else None, "run": str(made.run),
+    "page_psnr": page,
 }))
 """
 
@@ -89,7 +95,10 @@ def make_page(python: str, photos: Path, minutes: float | None, scores: bool, fo
 
 def show(name: str, found: dict[str, Any]) -> None:
     """Print the table of one page."""
-    print(f"\n{name}: {found['bytes'] / 1e6:.2f} MB, {found['psnr'] or float('nan'):.2f} dB")
+    scores = found["scores"] or {}
+    told = [f"{key} {scores[key]:.3f}" for key in ("psnr", "lpips", "detail") if scores.get(key) is not None]
+    told += [f"page {found['page_psnr']:.3f} dB"] if found.get("page_psnr") else []
+    print(f"\n{name}: {found['bytes'] / 1e6:.2f} MB, {', '.join(told) or 'not scored'}")
     wall, cpu = (sum(stage[k] for stage in found["stages"]) for k in (1, 2))
     for stage, w, c in [*found["stages"], ("all", wall, cpu)]:
         print(f"  {stage[:48]:48} {w:8.1f} s wall {c:8.1f} s CPU")

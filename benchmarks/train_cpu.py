@@ -25,7 +25,8 @@ from scene_experts.render import choose
 from scene_experts.reproduce.variants import read_line
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Event, Stepped
-from scene_experts.training.loop import Job, train
+from scene_experts.training.job import Job
+from scene_experts.training.loop import train
 from scene_experts.training.state import Training
 
 

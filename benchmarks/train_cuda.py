@@ -34,7 +34,7 @@ from scene_experts.render import Rasterizer, choose
 from scene_experts.training import loop as training
 from scene_experts.training.config import RunConfig, Train
 from scene_experts.training.events import Finished, Stepped
-from scene_experts.training.loop import Job
+from scene_experts.training.job import Job
 from scene_experts.training.options import TrainOptions
 from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training, resume

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from scene_experts.core.errors import RunError as RunError
     from scene_experts.making.make import MadeScene as MadeScene
     from scene_experts.making.make import make as make
+    from scene_experts.sfm.options import SourceOptions as SourceOptions
     from scene_experts.training.events import Densified as Densified
     from scene_experts.training.events import Event as Event
     from scene_experts.training.events import Exported as Exported
@@ -69,6 +70,7 @@ __all__ = [
     "RunError",
     "Saved",
     "Scores",
+    "SourceOptions",
     "Started",
     "Stepped",
     "Stopped",
@@ -91,6 +93,7 @@ _MODULES = {
     "api.trainer": ("Trainer", "train"),
     "core.errors": ("InputError", "RunError"),
     "making.make": ("MadeScene", "make"),
+    "sfm.options": ("SourceOptions",),
     "training.events": ("Densified", "Event", "Exported", "Finished", "Previewed", "Saved", "Started", "Stepped", "Stopped"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

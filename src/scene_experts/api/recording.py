@@ -21,11 +21,12 @@ from scene_experts.render import Rasterizer
 from scene_experts.training import loop, run_folder
 from scene_experts.training.config import check
 from scene_experts.training.events import Event, Exported, Finished, Started
+from scene_experts.training.job import Job
 from scene_experts.training.memory import give_back, used_bytes
 from scene_experts.training.record import Recorder
 
 
-def train(run: loop.Job, capture: Capture, rasterize: Rasterizer) -> Iterator[Event]:
+def train(run: Job, capture: Capture, rasterize: Rasterizer) -> Iterator[Event]:
     """Train the recipe of `run.config` on a capture; yields the events of the training.
 
     With a folder `run.out`: hold it, write config.json, metrics.jsonl, previews, checkpoints and,
@@ -85,7 +86,7 @@ def prepare_exports(out: Path, capture: Capture, rasterize: Rasterizer, device: 
     return tuple(filter(None, made))
 
 
-def check_settings(run: loop.Job) -> None:
+def check_settings(run: Job) -> None:
     """Raises InputError, naming the flag, for invalid settings."""
     check_fields(run.options)
     if run.max_memory > 0 and not used_bytes(torch.device("cpu")):

@@ -20,11 +20,13 @@ from scene_experts.api.recipe import Recipe, recipe
 from scene_experts.api.run import Run
 from scene_experts.core.errors import InputError
 from scene_experts.render import choose
-from scene_experts.training import loop, run_folder
+from scene_experts.training import run_folder
 from scene_experts.training.background import with_background
 from scene_experts.training.config import RunConfig, with_numbers
 from scene_experts.training.events import Event
+from scene_experts.training.job import Job
 from scene_experts.training.memory import forget_peak, reuse_freed
+from scene_experts.training.nearest import with_near_plane
 from scene_experts.training.options import TrainOptions
 from scene_experts.training.progress import TrainingProgress
 from scene_experts.training.run_folder import OpenRun
@@ -105,13 +107,14 @@ class Trainer:
             self.recipe = with_numbers(self.recipe, self.capture.numbers)
         words = command_of(self.recipe, self.capture.data, folder, options)
         config = RunConfig.of(self.recipe, self.capture.data, options, words, run_folder.versions())
-        recording.check_settings(loop.Job(config, options=options))
+        recording.check_settings(Job(config, options=options))
         if folder is not None:
             run_folder.check(folder, config, resume, overwrite)
             config = run_folder.as_begun(folder, config) if resume else config
         config, behind = with_background(config, self.capture.loaded)
+        config, behind = with_near_plane(config, behind)
         self.capture = Capture(config.data, behind, self.capture.seed, self.capture.numbers)
-        self._run = loop.Job(config, folder, where, options=options, begin=self._begin)
+        self._run = Job(config, folder, where, options=options, begin=self._begin)
         self._rasterize = rasterize
         self._training: Training | None = None
         self._ended = False

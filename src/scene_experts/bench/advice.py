@@ -21,12 +21,13 @@ from scene_experts.render import choose, gsplat_install
 LIMIT = 8.0  # minutes, so that a capture of few photographs, its training, scores and page take a quarter of an hour together
 SIDES = ((0, 7000), (1200, 7000), (800, 7000), (800, 4000), (600, 4000), (600, 3000), (600, 2000), (400, 2000))
 """Longest side in pixels (0: as it is) and iterations, the best first."""
-# Iterations of scene-experts on pyramid (0.10 megapixels), colosseum (0.23), banana (0.43), fox
-# (0.52) and sceaux (1.08) take 6.4, 5.6,
-# 5.7, 7.6 and 15.1 times the picture below. The line is near the first and the last, and above the
-# others.
+# Iterations take 6.4, 5.6, 5.7, 7.6 and 15.1 times the picture below on pyramid (0.10 megapixels),
+# colosseum (0.23), banana (0.43), fox (0.52) and sceaux (1.08): more pixels bring more Gaussians,
+# too. Larger photographs were not measured: there the time grows with the pixels alone.
 FEW, FEW_ITERATIONS = 30, 4000
-BASE, PER_MEGAPIXEL = 4.5, 9.8
+BASE, PER_MEGAPIXEL, MEASURED = 5.0, 9.5, 1.08
+SHORT = 2.5  # minutes below which seconds are told
+FREE = 0.85  # share of the processor from which a machine counts as idle
 SERIAL = 0.15  # share of an iteration that one thread does
 
 
@@ -47,8 +48,18 @@ class Advice:
         side = [] if self.side == 0 else ["--resolution", f"longest:{self.side}"]
         return [*side, "--iterations", str(self.iterations)]
 
-    def __str__(self) -> str:
-        return "" if self.minutes is None else f"about {max(1, round(self.minutes))} min on this machine if it is not busy"
+    def tell(self, share: float) -> str:
+        """Say how long it takes where it gets this share of the processor (`measure_share`); empty
+        if that is not known."""
+        if self.minutes is None:
+            return ""
+        alone, now = (f"about {say_minutes(minutes)}" for minutes in (self.minutes, self.minutes / share))
+        return f"{alone} on this machine" if share >= FREE else f"{now} beside what else this machine does now ({alone} alone)"
+
+
+def say_minutes(minutes: float) -> str:
+    """Say a time as whole minutes, or as tens of seconds where it is short."""
+    return f"{round(minutes)} min" if minutes >= SHORT else f"{max(1, round(6 * minutes)) * 10} s"
 
 
 def measure_picture() -> float:
@@ -76,8 +87,8 @@ def recall_picture() -> float:
 
 def estimate_minutes(width: int, height: int, iterations: int, picture: float, threads: int) -> float:
     """Minutes of a training. picture: see `measure_picture`."""
-    gain = 1 / (SERIAL + (1 - SERIAL) / threads)
-    return iterations * picture * (BASE + PER_MEGAPIXEL * width * height / 1e6) / gain / 60
+    gain, pixels = 1 / (SERIAL + (1 - SERIAL) / threads), width * height / 1e6
+    return iterations * picture * (BASE + PER_MEGAPIXEL * pixels * min(1.0, pixels / MEASURED)) / gain / 60
 
 
 def suggest(width: int, height: int, views: int, picture: float | None = None, limit: float | None = None) -> Advice:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import platform
+import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +14,7 @@ import torch
 from scene_experts.bench import peer
 from scene_experts.bench.measure import Clock, choose_clock, measure_minima
 from scene_experts.native import library as native
+from scene_experts.training.clock import load_average
 
 CHUNKS = 100  # chunks of the arithmetic loop: about a millisecond
 
@@ -47,6 +51,27 @@ def read_processor_name() -> str:
         lines = []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor() or platform.machine()
+
+
+def measure_share(threads: int, seconds: float = 0.5) -> float:
+    """Share of the processor, above 0 to 1, that this many busy threads of this process get beside
+    what else runs: now, or by the system's load of the last minute, whichever is more. Takes
+    `seconds`."""
+    data, until = bytes(1 << 16), time.monotonic() + seconds
+
+    def work() -> None:
+        while time.monotonic() < until:
+            hashlib.sha256(data).digest()  # releases the interpreter's lock
+
+    began, cpu = time.monotonic(), time.process_time()
+    busy = [threading.Thread(target=work) for _ in range(threads)]
+    for thread in busy:
+        thread.start()
+    for thread in busy:
+        thread.join()
+    now = (time.process_time() - cpu) / (time.monotonic() - began) / threads
+    load = load_average()
+    return min(1.0, max(0.01, now, 0.0 if load is None else native.count_cores() / (load + threads)))
 
 
 def measure_multiply_adds(level: str | None, threads: int, seconds: float, clock: Clock | None = None) -> float | None:

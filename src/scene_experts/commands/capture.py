@@ -9,13 +9,8 @@ from typing import Annotated, Any
 from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import Command, parse
 from scene_experts.commands import PROG
-from scene_experts.core.errors import few
 from scene_experts.core.signals import handled
 from scene_experts.sfm.options import SfmOptions
-
-MOST_REASONS = 8  # lines about photographs without a pose
-LEAST = 12  # fewer photographs with a pose get a warning
-FEW = 0.9  # a smaller share of photographs with a pose gets a warning
 
 
 @dataclass(frozen=True)
@@ -67,11 +62,12 @@ def interrupt(*_: object) -> None:
 def summarise(note: dict[str, Any]) -> list[str]:
     """Lines about the result, with advice if few photographs have a pose."""
     from scene_experts.sfm.drift import DRIFT, KEY
+    from scene_experts.sfm.lacking import explain_lacking
     from scene_experts.training.progress import format_duration
 
-    have, all_, without = note["with_pose"], note["photographs"], note["without_pose"]
     lines = [
-        f"{have} of {all_} photographs have a pose: {note['points']:,} points, {note['observations']:.0f} points per photograph, "
+        f"{note['with_pose']} of {note['photographs']} photographs have a pose: "
+        f"{note['points']:,} points, {note['observations']:.0f} points per photograph, "
         f"mean error {note['error']:.2f} px, {note['mapper']} mapper, {format_duration(note['seconds'])} min"
     ]
     if (drift := note.get(KEY) or 0) >= DRIFT:
@@ -80,18 +76,4 @@ def summarise(note: dict[str, Any]) -> list[str]:
     if len(tried) > 1:
         posed = " and ".join(f"{count} from the {name} mapper" for name, count in tried.items())
         lines.append(f"poses: {posed}; the result of the {note['mapper']} mapper is kept")
-    if without:
-        lines.append(f"photographs without a pose: {few(without, 8)}")
-    reasons: dict[str, list[str]] = {}
-    for name, why in note.get("why", {}).items():
-        reasons.setdefault(why, []).append(name)
-    lines += [f"  {few(names, 4)}: {why}" for why, names in sorted(reasons.items(), key=lambda item: -len(item[1]))[:MOST_REASONS]]
-    if note["apart"]:
-        parts = ", ".join(map(str, note["apart"]))
-        lines.append(f"warning: {parts} of these fit together, but not with the others; add photographs that connect them")
-    if have < FEW * all_:
-        more = "" if note["all_compared"] else "; --matching exhaustive --overwrite may find more poses"
-        lines.append(f"warning: every part of the scene should be sharp in at least three photographs from different positions{more}")
-    if have < LEAST:
-        lines.append(f"warning: {have} photographs show a small part of a scene; take 30 or more that overlap strongly")
-    return lines
+    return lines + explain_lacking(note, "--matching exhaustive --overwrite")

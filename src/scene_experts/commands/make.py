@@ -11,6 +11,10 @@ from scene_experts.arguments.parse import Command, parse
 from scene_experts.commands import PROG
 from scene_experts.core.fields import NotNegative
 from scene_experts.core.signals import handled
+from scene_experts.sfm.options import SourceOptions
+
+FIRST = ("out", "minutes", "scores", "open", "frames", "nadir")
+"""The options that people use first, for --help."""
 
 
 @dataclass(frozen=True)
@@ -27,16 +31,18 @@ class MakeCommand:
     out: Annotated[Path | None, Option(value="FOLDER")] = None
     """Folder to write; by default the name of PHOTOS with -scene, in this folder."""
     minutes: NotNegative = 0.0
-    """Time for the whole; it decides iterations, resolution and effort. 0: what `info` proposes."""
+    """Time for the whole; it decides iterations, resolution and effort. 0: a training of at most 8
+    minutes on this machine if it is not busy."""
     scores: bool = False
     """Hold out every 8th photograph, score it, and write a report. Otherwise all photographs are
     trained on."""
     open: bool = False
     """Open the page in the browser at the end."""
+    options: Annotated[SourceOptions, Option(name="")] = SourceOptions()
 
 
 def make(args: list[str]) -> int:
-    command = parse(MakeCommand, Command(f"{PROG} make", ("photos",)), args)
+    command = parse(MakeCommand, Command(f"{PROG} make", ("photos",), FIRST), args)
 
     from webbrowser import open_new_tab
 
@@ -49,7 +55,15 @@ def make(args: list[str]) -> int:
     console = Console(markup=False, highlight=False)
     say = lambda text: console.print(text, soft_wrap=True, markup=False)  # noqa: E731
     with handled(interrupt), ProgressBar(console) as bar:
-        made = run(command.photos, command.out, minutes=command.minutes or None, scores=command.scores, say=say, progress=bar)
+        made = run(
+            command.photos,
+            command.out,
+            minutes=command.minutes or None,
+            scores=command.scores,
+            options=command.options,
+            say=say,
+            progress=bar,
+        )
     times = ", ".join(f"{name} {format_duration(took)}" for name, took in made.seconds.items() if took >= 1)
     say(f"time: {times}" if times else "everything was there already")
     if made.psnr is not None:

@@ -27,13 +27,15 @@ from scene_experts.data.capture import Capture
 from scene_experts.data.fetch.catalog import defaults_in
 from scene_experts.data.settings import Data
 from scene_experts.render import Rasterizer
+from scene_experts.sfm.drift import warn_of_steady
 from scene_experts.training import run_folder
 from scene_experts.training.background import with_background
 from scene_experts.training.batch import check_batch
 from scene_experts.training.config import RunConfig, Train, with_numbers
 from scene_experts.training.events import Exported, Stopped
-from scene_experts.training.loop import Job
+from scene_experts.training.job import Job
 from scene_experts.training.memory import reuse_freed
+from scene_experts.training.nearest import with_near_plane
 from scene_experts.training.options import TrainOptions
 from scene_experts.training.progress import TrainingProgress
 from scene_experts.training.recipes import RECIPES
@@ -106,7 +108,8 @@ def train(args: list[str]) -> int:
     line = shlex.join([PROG, "train", *(arg for arg in args if arg != "--resume")])  # the command of the whole run
     command, run, capture, rasterize = group.agree(lambda: prepare(command, line, group))
     console = Console(markup=False, highlight=False, quiet=not group.first)
-    for warning in capture.warnings if group.first else ():
+    steady = warn_of_steady(capture.root) if command.cfg.exposure else None
+    for warning in (*capture.warnings, *([steady] if steady else [])) if group.first else ():
         print(f"warning: {warning}", file=sys.stderr)
     what = f"{command.cfg.recipe} on {capture.name} ({len(capture.train)} training views, {len(capture.test)} held out)"
     together = f", {group.size} processes" if group.size > 1 else ""
@@ -114,6 +117,8 @@ def train(args: list[str]) -> int:
     if run.config.data.background != command.data.background:
         colour = " ".join(f"{value:g}" for value in capture.background)
         console.print(f"background: the photographs' mean colour, {colour} (choose another with --background)", soft_wrap=True)
+    if run.config.data.near != command.data.near:
+        console.print(f"near plane: {run.config.data.near:g}, by what the photographs show (choose another with --near)", soft_wrap=True)
     code = follow(command, run, capture, rasterize, console)
     group.leave()
     return code
@@ -144,7 +149,7 @@ def prepare(command: TrainCommand, line: str, group: Alone) -> tuple[TrainComman
     )
     run_folder.check(command.out, run.config, options.resume, options.overwrite)
     begun = run_folder.as_begun(command.out, run.config) if options.resume else run.config
-    config, capture = with_background(begun, captures.load(begun.data, command.cfg.seed))
+    config, capture = with_near_plane(*with_background(begun, captures.load(begun.data, command.cfg.seed)))
     return command, replace(run, config=config, device=device), capture, rasterize
 
 

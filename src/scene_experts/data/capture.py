@@ -20,6 +20,7 @@ from scene_experts.data.blocks import read_view_names
 from scene_experts.data.colour import find_white
 from scene_experts.data.copies import tell_copies
 from scene_experts.data.depth_maps import DepthPhoto, find_points
+from scene_experts.data.equirectangular import find_place
 from scene_experts.data.images import FrameSource, check_policy, probe
 from scene_experts.data.lens import centre_principal_point, to_pinhole
 from scene_experts.data.masks import find_masks
@@ -150,13 +151,18 @@ def _leave_out(root: Path, raw: RawCapture, written: tuple[str, ...]) -> tuple[R
             hint = nearest(word, dict.fromkeys(key for name in sorted(names) for key in (name, Path(name).name, Path(name).stem)))
             hint = hint or f"; they are {few(sorted(names))}"
             raise InputError(f"expected names of photographs of {root} after --leave-out, found {word!r}{hint}")
-        if len(found) > 1:
+        if len(found) > 1 and not _of_one_panorama(found):
             raise InputError(f"expected one photograph for --leave-out {word}, found {len(found)} ({few(found)}); write its folder too")
-        omitted.add(found[0])
+        omitted.update(found)
     kept = [image for image, name in zip(raw.images, names) if name not in omitted]
     if not kept:
         raise InputError(f"expected photographs of {root} beside those of --leave-out, found none; leave out fewer")
     return replace(raw, images=kept), tuple(sorted(omitted))
+
+
+def _of_one_panorama(names: list[str]) -> bool:
+    """Whether photographs are views of one panorama, which are left out together."""
+    return len({find_place(name) for name in names}) == 1 and all(find_place(name) != name for name in names)
 
 
 def _find_image_folder(root: Path, images: str | None, policy: str) -> str | None:
@@ -218,6 +224,7 @@ def _assemble(root: Path, kind: str, raw: RawCapture, centred: bool, background:
         states_split=raw.states_split,
         bounds=raw.bounds,
         applied=raw.applied,
+        model=raw.model,
     )
 
 

@@ -45,6 +45,13 @@ class PanoramaView:
 
 VIEWS = tuple(PanoramaView(yaw, pitch) for pitch, first in ((0, 45), (35, 0), (-35, 0)) for yaw in range(first, 360, 90))
 """Twelve views: all that lies within 75 degrees of the horizon is in one of them, most in two."""
+FOLDERS = frozenset(view.folder for view in VIEWS)
+
+
+def find_place(name: str) -> str:
+    """Return the panorama that a photograph was cut from; of others, their own name."""
+    folder, _, rest = name.partition("/")
+    return rest if folder in FOLDERS else name
 
 
 def view_side(width: int) -> int:

@@ -134,6 +134,7 @@ class Capture:
 
     applied: object = None  # rows of the 3x4 matrix that turned a reconstruction into the capture's own frame, unchecked
     random_points: bool = False  # its points are random
+    model: Path | None = None  # folder of the reconstruction that was read, if it is COLMAP's
     omitted: tuple[str, ...] = ()  # names of the photographs that --leave-out leaves out; they have no views
     posed: str = ""  # `poses` before `with_cameras`
     left_out: tuple[int, ...] = ()  # indices of training views that --views leaves out; they still identify the capture

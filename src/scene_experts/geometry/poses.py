@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -36,6 +37,15 @@ def exp_motion(motion: Tensor) -> Tensor:
     o = torch.zeros_like(x)
     twist = torch.stack([o, -z, y, move[0], z, o, -x, move[1], -y, x, o, move[2], o, o, o, o]).view(4, 4)
     return torch.linalg.matrix_exp(twist)
+
+
+def log_motion(pose: Tensor) -> Tensor:
+    """Return the twist [6] float64 of a rigid motion [4, 4] that turns by less than pi: the inverse of
+    `exp_motion`."""
+    from scipy.linalg import logm  # takes long to import, and most commands do not need it
+
+    twist = torch.from_numpy(np.real(np.asarray(logm(pose.double().cpu().numpy()))).copy())
+    return torch.cat([torch.stack([twist[2, 1], twist[0, 2], twist[1, 0]]), twist[:3, 3]])
 
 
 def look_at(position: Tensor, target: Tensor, up: Tensor) -> Tensor:

@@ -7,9 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from scene_experts.bench.advice import FEW, Advice, suggest
-from scene_experts.core.progress import Progress
-from scene_experts.training.progress import format_duration
+from scene_experts.core.progress import Progress, Speedometer
+from scene_experts.training.progress import count_left, format_duration
 
+TRAINING = "training"  # the work whose parts become longer
 FOR_PAGE = 0.05  # share of the time after the poses that the page gets
 LEAST_PAGE, MOST_PAGE = 15.0, 60.0  # seconds of it
 FOR_SCORES = 0.15  # the same for the scores, where they are asked for
@@ -19,7 +20,7 @@ trainings of 4,000 iterations on banana, brighton, fern and kitchen."""
 LOOK = 0.1  # share of the iterations after which the speed is known
 CLOSE = (0.8, 1.3)  # a training whose time will be this share of what it has is not begun anew
 LEAST, MOST, MOST_OF_FEW = 300, 30_000, 7_000  # iterations; the last with few photographs (`bench.advice.FEW`)
-PAGE_GUESS = 20.0  # seconds, before anything is known
+PAGE_GUESS, SCORES_GUESS = 20.0, 40.0  # seconds, before anything is known
 
 
 @dataclass(frozen=True)
@@ -53,19 +54,20 @@ class Whole:
     later stages are expected to take."""
 
     def __init__(self, progress: Progress, now: Callable[[], float] = time.monotonic) -> None:
-        self.progress, self.now = progress, now
+        self.progress, self.now, self.what, self.pace = progress, now, "", Speedometer(now)
         self.later = 0.0  # seconds of the stages after this one
-        self.what, self.began, self.first = "", now(), 0
+        self.least: Callable[[], float] = lambda: 0.0  # seconds that the whole takes in any case
 
     def __call__(self, what: str, done: int, total: int) -> None:
         """Show that `done` of `total` parts of the work `what` are done."""
         if what != self.what:
-            self.what, self.began, self.first = what, self.now(), done
-        parts, elapsed = done - self.first, self.now() - self.began
-        if parts <= 0 or total <= 0:
+            self.what, self.pace = what, Speedometer(self.now)
+        speed = self.pace(done)
+        if speed is None or total <= 0:
             self.progress(what, done, total)
             return
-        left = elapsed / parts * max(0, total - done) + self.later
+        parts = count_left(done, total) if what == TRAINING else max(0, total - done)
+        left = max(parts / speed + self.later, self.least())
         self.progress(f"{what} (about {format_duration(left)} left in all)", done, total)
 
 

@@ -2,33 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from statistics import fmean
 from time import monotonic
 from typing import Any
 
+import torch
+
 from scene_experts.api.capture import Capture, load_capture
 from scene_experts.api.recipe import Recipe, recipe
 from scene_experts.api.run import Run
 from scene_experts.api.trainer import Trainer
-from scene_experts.bench.advice import LIMIT
+from scene_experts.bench.advice import LIMIT, Advice
+from scene_experts.bench.machine import measure_share
+from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.fields import flag_of
 from scene_experts.core.io import read_json, write_json
 from scene_experts.core.progress import Progress
+from scene_experts.core.signals import handled
 from scene_experts.data.readers import is_capture
 from scene_experts.files.export import export_several
 from scene_experts.files.options import Options
-from scene_experts.making.budget import LOOK, PAGE_GUESS, TimeBudget, Whole, find_slowness, plan_training
+from scene_experts.making.budget import LOOK, PAGE_GUESS, SCORES_GUESS, TRAINING, TimeBudget, Whole, find_slowness, plan_training
 from scene_experts.sfm.drift import drifts
-from scene_experts.sfm.options import SfmOptions
-from scene_experts.sfm.reconstruct import reconstruct
+from scene_experts.sfm.lacking import explain_lacking
+from scene_experts.sfm.options import SfmOptions, SourceOptions
+from scene_experts.sfm.reconstruct import NOTE, reconstruct
 from scene_experts.training import run_folder
-from scene_experts.training.events import Stepped
+from scene_experts.training.config import RunConfig
+from scene_experts.training.events import Event, Stepped
 from scene_experts.training.recipes import PROPOSED
 
 CAPTURE, RUN, PAGE, SOURCE = "capture", "run", "scene.html", "source.json"
+PLAIN = SourceOptions()
+SAVE_EVERY = 1000  # iterations that a killed training loses at most
 RECENT = 200  # iterations whose time counts as that of one at the end
 
 
@@ -57,6 +69,7 @@ def make(
     *,
     minutes: float | None = None,
     scores: bool = False,
+    options: SourceOptions = PLAIN,
     say: Callable[[str], None] = print,
     progress: Progress = lambda what, done, total: None,
 ) -> MadeScene:
@@ -70,6 +83,7 @@ def make(
         minutes: Time for the whole, above 0. It decides iterations, resolution and effort; poses
             take what they take. Default: what `info` proposes.
         scores: Hold out every 8th photograph and score it. Default: train on all of them.
+        options: What the photographs or the video need: frames of a video, panoramas, matching.
         say: Called with each message.
         progress: Called with the name of the work, how much is done and how much there is.
 
@@ -86,11 +100,12 @@ def make(
     folder = Path(out) if out is not None else Path(f"{source.resolve().stem}-scene")
     took: dict[str, float] = {}
     show, began = Whole(progress), monotonic()
-    show.later = PAGE_GUESS + 60 * LIMIT if minutes is None else 60 * minutes
-    place = find_poses(source, folder, say, show)
-    took["poses"] = monotonic() - began
+    show.later, show.least = (PAGE_GUESS + 60 * LIMIT if minutes is None else PAGE_GUESS), lambda: budget.left or 0.0
+    place = find_poses(source, folder, options, say, show)
+    took["poses"], show.least = monotonic() - began, lambda: 0.0
     plan = prepare(place, folder / RUN, budget, scores, say)
-    show.later, began = PAGE_GUESS if budget.left is None else budget.left - (budget.for_training(scores) or 0.0), monotonic()
+    rest = PAGE_GUESS + (SCORES_GUESS if scores else 0.0)
+    show.later, began = rest if budget.left is None else budget.left - (budget.for_training(scores) or 0.0), monotonic()
     run, psnr = train(plan, folder / RUN, budget, scores, show, say)
     took["training"] = monotonic() - began
     report, began, show.later = None, monotonic(), 0.0
@@ -105,9 +120,16 @@ def make(
     return MadeScene(page, folder / RUN, place, report, psnr, took)
 
 
-def find_poses(source: Path, folder: Path, say: Callable[[str], None], progress: Progress) -> Path:
-    """Return the capture: the source if it is one, or that of an earlier call, or a new one."""
+def find_poses(source: Path, folder: Path, options: SourceOptions, say: Callable[[str], None], progress: Progress) -> Path:
+    """Return the capture: the source if it is one, or that of an earlier call, or a new one.
+
+    Raises InputError where the poses that are there were found in another way.
+    """
     if source.is_dir() and is_capture(source):
+        if asked := list_changes(asdict(PLAIN), options):
+            raise InputError(
+                f"expected photographs or a video with {asked[0][0]}, found the capture {source}, which has poses; leave it out"
+            )
         return source
     place, note, here = folder / CAPTURE, folder / SOURCE, str(source.resolve())
     if is_capture(place):
@@ -116,13 +138,33 @@ def find_poses(source: Path, folder: Path, say: Callable[[str], None], progress:
             raise InputError(
                 f"expected the scene of {here} in {folder}, found one of other photographs or of an unknown source; choose another --out"
             )
+        expect_same(place, options)
         say(f"poses: those in {place}; after a change of the photographs, remove that folder and {folder / RUN}")
         return place
-    folder.mkdir(parents=True, exist_ok=True)
+    found = reconstruct(source, place, SfmOptions(**asdict(options)), say=say, progress=progress)
     write_json(note, {"source": here})
-    found = reconstruct(source, place, SfmOptions(), say=say, progress=progress)
     say(f"poses: {found['with_pose']} of {found['photographs']} photographs, {found['points']:,} points")
+    for line in explain_lacking(found, f"--matching exhaustive --out {folder}-2"):
+        say(line)
     return place
+
+
+def list_changes(before: Any, options: SourceOptions) -> list[tuple[str, Any, Any]]:
+    """Return the options whose value is another one than in `before`, the options of an earlier call
+    by name: their flags, the value before and the value now. What `before` lacks counts as equal."""
+    known = before if isinstance(before, dict) else {}
+    now = [(f.name, getattr(options, f.name)) for f in fields(options)]
+    return [(flag_of(name), known[name], value) for name, value in now if name in known and known[name] != value]
+
+
+def expect_same(place: Path, options: SourceOptions) -> None:
+    """Raise InputError if the capture was made with other options."""
+    note = read_json(place / NOTE, "note of a capture") if (place / NOTE).is_file() else None
+    for flag, before, now in list_changes(note.get("options") if isinstance(note, dict) else None, options):
+        raise InputError(
+            f"expected {flag} {before}, with which the poses in {place} were found, found {now}; give {flag} {before}, "
+            f"or choose another --out"
+        )
 
 
 @dataclass(frozen=True)
@@ -134,7 +176,8 @@ class TrainingPlan:
     size: tuple[int, int]  # of the whole photographs, px
     capture: Capture
     recipe: Recipe
-    minutes: float | None = None  # as estimated
+    advice: Advice | None = None  # what was estimated
+    slow: float = 1.0  # times that the machine takes of it, as far as known
     begun: bool = False  # by an earlier call
 
     def fit(self, have: float | None, slow: float = 1.0) -> TrainingPlan:
@@ -144,7 +187,14 @@ class TrainingPlan:
         resolution = f"longest:{advice.side}" if advice.side else "auto"
         capture = load_capture(self.place, split=self.split, resolution=resolution)
         chosen = recipe(PROPOSED, iterations=advice.iterations, exposure=self.recipe.exposure)
-        return replace(self, capture=capture, recipe=chosen, minutes=advice.minutes)
+        return replace(self, capture=capture, recipe=chosen, advice=advice, slow=slow)
+
+    def pays(self, other: TrainingPlan, step: int) -> bool:
+        """Return whether another plan, begun now, ends sooner than this one from `step` on, or is
+        for a machine that is faster than was known."""
+        if other.slow < self.slow or self.advice is None or self.advice.minutes is None or other.advice is None:
+            return True
+        return (other.advice.minutes or 0.0) < self.advice.minutes * (1 - step / self.recipe.iterations)
 
 
 def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Callable[[str], None]) -> TrainingPlan:
@@ -161,20 +211,30 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
                 f"expected a run with the same photographs held out in {folder}, found one where {told}; "
                 f"{'leave --scores out' if scores else 'add --scores'}, or choose another --out"
             )
-        say(f"training: continues that in {folder}; to train anew, with other minutes, remove that folder")
+        say(f"training: {describe_begun(folder, begun)}")
         split = begun.data.split
         capture = load_capture(place, split=split, resolution=begun.data.resolution, seed=begun.train.seed)
         return TrainingPlan(place, split, (0, 0), capture, begun.train, begun=True)
     whole = load_capture(place, split=split)
     lens = whole.cameras[0]
     first = TrainingPlan(place, split, (lens.width, lens.height), whole, recipe(PROPOSED, exposure=drifts(place)))
-    plan = first.fit(budget.for_training(scores))
+    share = measure_share(torch.get_num_threads())
+    plan = first.fit(budget.for_training(scores), 1 / share)
     held = f", {len(whole.test_cameras)} held out" if scores else ""
-    about = "" if plan.minutes is None else f", about {max(1, round(plan.minutes))} min if the machine is not busy"
+    about = f", {told}" if plan.advice and (told := plan.advice.tell(share)) else ""
     learned = ", their exposures" if plan.recipe.exposure else ""
     what = f"{plan.recipe.iterations:,} iterations, {plan.capture.data.resolution}, {len(whole.train_cameras)} photographs{learned}"
     say(f"training: {plan.recipe.recipe}, {what}{held}{about}")
     return plan
+
+
+def describe_begun(folder: Path, config: RunConfig) -> str:
+    """Say how far the training in a run folder is, and how to get another one."""
+    saved, iterations = checkpoint.latest(folder / "checkpoints"), config.train.iterations
+    step = 0 if saved is None else int(saved.stem.rpartition("_")[2])
+    state = f"that in {folder} is complete" if step >= iterations else f"continues that in {folder} at iteration {step:,}"
+    again = "remove that folder and repeat the command with other --minutes; the poses are kept"
+    return f"{state}: {iterations:,} iterations, {config.data.resolution}; to train anew, {again}"
 
 
 def train(
@@ -187,27 +247,47 @@ def train(
     """
     settled = plan.begun
     while True:
-        have, slow = budget.for_training(scores), None
-        trainer = Trainer(plan.recipe, plan.capture, folder, resume=plan.begun, overwrite=not plan.begun, preview_every=0)
+        have, other = budget.for_training(scores), None
+        begun, minutes = plan.begun, plan.advice.minutes if plan.advice else None
+        trainer = Trainer(plan.recipe, plan.capture, folder, resume=begun, overwrite=not begun, preview_every=0, save_every=SAVE_EVERY)
         recent: list[Stepped] = []
-        for event in trainer:
+        for event in saved_when_interrupted(trainer):
             if not isinstance(event, Stepped):
                 continue
-            progress("training", event.step, plan.recipe.iterations)
+            progress(TRAINING, event.step, plan.recipe.iterations)
             recent = [*(one for one in recent if event.step - one.step <= RECENT), event]
             if not settled and have is not None and event.step >= LOOK * plan.recipe.iterations:
                 settled = True
-                slow = find_slowness(plan.recipe.iterations, event.step, event.seconds, plan.minutes, have)
-                if slow is not None:
+                slow = find_slowness(plan.recipe.iterations, event.step, event.seconds, minutes, have)
+                other = None if slow is None else plan.fit(budget.for_training(scores), slow)
+                if other and plan.pays(other, event.step):
                     trainer.stop("another training fits the time")
-        if slow is None:
+                else:
+                    other = None
+        if other is None:
             break
-        plan = plan.fit(budget.for_training(scores), slow)
-        how = "slower" if slow > 1 else "faster"
-        now = f"{plan.recipe.iterations:,} iterations, {plan.capture.data.resolution}"
+        how = "slower" if other.slow > plan.slow else "faster"
+        plan, now = other, f"{other.recipe.iterations:,} iterations, {other.capture.data.resolution}"
         say(f"the machine is {how} than estimated: the training begins anew, {now}")
     psnr = fmean(one.psnr for one in recent) if recent else None
     return trainer.run, psnr
+
+
+def saved_when_interrupted(trainer: Trainer) -> Iterator[Event]:
+    """Yield the events of a training. The first signal that ends a command saves it and then raises
+    KeyboardInterrupt, the second raises it at once."""
+    asked: list[int] = []
+
+    def stop(number: int, _: object) -> None:
+        if asked:
+            raise KeyboardInterrupt
+        asked.append(number)
+        trainer.stop("interrupted")
+
+    with handled(stop) if threading.current_thread() is threading.main_thread() else nullcontext():
+        yield from trainer
+    if asked:
+        raise KeyboardInterrupt
 
 
 def write_page(folder: Path, options: Options, progress: Progress) -> Path:
@@ -216,6 +296,7 @@ def write_page(folder: Path, options: Options, progress: Progress) -> Path:
     newest = max(path.stat().st_mtime for path in (run / "checkpoints").glob("ckpt_*.safetensors"))
     if page.is_file() and page.stat().st_mtime > newest:
         return page
+    progress("page", 0, 1)
     opened: Any = run_folder.open_run(run)
     written = export_several(opened, ("html",), page, options, tell=progress)
     if not written:

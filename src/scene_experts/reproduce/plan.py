@@ -144,11 +144,15 @@ class Spec:
 def identity(scene: str, train: Train, data: Data, code: str = "", start: Path | None = None) -> str:
     """Return the hash that names a run: of the scene's name, what differs from the defaults of the
     recipe's parts (`lean`) and of how the capture is read (not its path), the code of other
-    packages (`code_of`), and the name of the run whose scene it started from."""
+    packages (`code_of`), and the name of the run whose scene it started from. A background
+    and a near plane that the recipe computes (`mean_background`, `near_share`) follow from the
+    rest."""
     more = [code] if code else []
     more += [f"from {start.name}"] if start else []
     as_read = from_json(Train, to_json(train))  # 2 in place of 2.0 is the same setting
-    text = json.dumps([scene, lean(as_read), data.settings(), *more], sort_keys=True)
+    stated = replace(data, background=None) if train.mean_background else data
+    stated = replace(stated, near=None) if train.near_share else stated
+    text = json.dumps([scene, lean(as_read), stated.settings(), *more], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 

@@ -26,13 +26,13 @@ from torch import Tensor, nn
 
 from scene_experts.core.schedule import Rate
 from scene_experts.core.types import Camera, Gaussians
-from scene_experts.geometry.poses import exp_motion
+from scene_experts.geometry.poses import exp_motion, log_motion
 from scene_experts.scene.per_view import PerView
 
 GROUP = "poses"  # name of the learning rate, and of the tensors in a checkpoint
-RATE = Rate(3e-4, 3e-6)  # rad and extents, from the start of the training to the end
+RATE = Rate(1e-4, 1e-6)  # rad and extents, from the start of the training to the end
 BEGIN, FULL = 0.05, 0.15  # shares of the training: until the first no pose moves, from the second on at the whole rate
-BUFFERS = ("ids", "gauge", "extent")
+BUFFERS = ("ids", "gauge", "extent", "begun")
 
 
 class Poses(PerView):
@@ -42,6 +42,7 @@ class Poses(PerView):
     motions: nn.Parameter  # [V, 6] rotation, translation
     gauge: Tensor  # [V, 6, G] orthonormal columns: motions of the whole world
     extent: Tensor  # [] trained world units
+    begun: Tensor  # [V, 6] the motions that the training begins with: those of the whole world are taken out of what follows
 
     def __init__(self, cameras: Sequence[Camera], extent: float) -> None:
         """extent: that of the capture, in trained world units."""
@@ -50,6 +51,7 @@ class Poses(PerView):
         self.set_cameras(cameras)
         self.register_buffer("gauge", find_gauge(cameras, extent).float())
         self.register_buffer("extent", torch.tensor(float(extent)))
+        self.register_buffer("begun", torch.zeros(len(cameras), 6))
 
     def continue_from(self, earlier: Poses) -> None:
         """Take the motions of the views that an earlier training has refined."""
@@ -57,11 +59,20 @@ class Poses(PerView):
             found = earlier.without_gauge()
             for id, row in self.row.items():
                 if id in earlier.row:
-                    self.motions[row] = found[earlier.row[id]]
+                    self.motions[row] = self.begun[row] = found[earlier.row[id]]
+
+    @torch.no_grad()
+    def begin_at(self, cameras: Sequence[Camera], adjusted: Sequence[Camera]) -> None:
+        """Begin with the motions that take the training cameras to their `adjusted` poses."""
+        for camera, other in zip(cameras, adjusted):
+            pose = other.world_to_cam.double() @ torch.linalg.inv(camera.world_to_cam.double())
+            turn, move = log_motion(pose).split(3)
+            row = self.row[camera.id]
+            self.motions[row] = self.begun[row] = torch.cat([turn, move / self.extent.double()]).to(self.motions)
 
     def without_gauge(self) -> Tensor:
         """Return the motions [V, 6] without those of the whole world."""
-        along = (self.gauge * self.motions[:, :, None]).sum(1).sum(0)  # [G]
+        along = (self.gauge * (self.motions - self.begun)[:, :, None]).sum(1).sum(0)  # [G]
         return self.motions - (self.gauge * along).sum(2)
 
     def pose_of(self, camera: Camera) -> Tensor | None:

@@ -71,13 +71,27 @@ def look(path: Path, places: NDArray[np.float64], size: tuple[int, int]) -> NDAr
     return pixels[y, x] / 255
 
 
-def drifts(capture: Path) -> bool:
-    """Return whether a training on a capture learns exposures: what `capture` has measured says
-    so."""
+def read_drift(capture: Path) -> float | None:
+    """Return the drift in stops that `capture` has measured; None if it has not."""
     note = capture / NOTE
     try:
         found = read_json(note, "note of a capture") if note.is_file() else None
         value = found.get(KEY) if isinstance(found, dict) else None
-        return value is not None and number(value, KEY, 0, 100) >= DRIFT
+        return None if value is None else number(value, KEY, 0, 100)
     except (InputError, Damaged):
-        return False
+        return None
+
+
+def drifts(capture: Path) -> bool:
+    """Return whether a training on a capture learns exposures: what `capture` has measured says
+    so."""
+    return (read_drift(capture) or 0) >= DRIFT
+
+
+def warn_of_steady(capture: Path) -> str | None:
+    """Return a warning for a training that learns exposures although `capture` has found them
+    alike."""
+    drift = read_drift(capture)
+    if drift is None or drift >= DRIFT:
+        return None
+    return f"the exposures of {capture} differ by {drift:.2f} stops only: --exposure may lose 0.1 to 0.2 dB; leave it out below {DRIFT}"

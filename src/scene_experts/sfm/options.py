@@ -1,4 +1,4 @@
-"""Settings of a reconstruction: the options of `scene-experts capture`."""
+"""Settings of a reconstruction: the options of `scene-experts capture`, some of which `make` has too."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ Features = Literal["auto", "sift", "learned"]
 
 
 @dataclass(frozen=True)
-class SfmOptions:
-    """Settings of the reconstruction."""
+class SourceOptions:
+    """What the photographs or the video need: the settings that `capture` and `make` share."""
 
     frames: Annotated[int, Range(3, MOST_FRAMES)] = 150
     """Number of frames to extract from a video. The sharpest frame of each of this many equal
@@ -45,6 +45,12 @@ class SfmOptions:
     nadir: Annotated[float, Range(0, 60)] = 0.0
     """Degrees around straight down that masks leave out of panoramas, for who or what carries the
     camera."""
+
+
+@dataclass(frozen=True)
+class SfmOptions(SourceOptions):
+    """Settings of the reconstruction."""
+
     max_side: Annotated[int, Range(64, LARGEST)] = 1600
     """Longest side in pixels at which features are extracted. The photographs themselves are not
     changed."""

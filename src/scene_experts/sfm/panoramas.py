@@ -17,13 +17,12 @@ from scene_experts.core.io import read_json, write_atomic, write_json
 from scene_experts.core.reading.budget import CAPTURED
 from scene_experts.core.reading.pictures import opening_picture
 from scene_experts.data.colour import is_deep, lift, to_8_bit
-from scene_experts.data.equirectangular import FIELD, VIEWS, find_places, mask_nadir, sample, view_side
+from scene_experts.data.equirectangular import FIELD, FOLDERS, VIEWS, find_place, find_places, mask_nadir, sample, view_side
 from scene_experts.data.masks import Mask
 from scene_experts.sfm.options import SfmOptions
-from scene_experts.sfm.photos import ORIENTATION, Photo, check_in_place, copy_photos, natural_key, read_stored_mask
+from scene_experts.sfm.photos import ORIENTATION, Photo, check_in_place, copy_photos, natural_key, read_stored_mask, turn_upright
 
 CUT = "cut.json"
-FOLDERS = frozenset(view.folder for view in VIEWS)
 
 
 @dataclass(frozen=True)
@@ -80,12 +79,6 @@ def take_photos(
     return [*copied, *views], rig
 
 
-def find_place(name: str) -> str:
-    """Return the panorama that a photograph was cut from; of others, their own name."""
-    folder, _, rest = name.partition("/")
-    return rest if folder in FOLDERS else name
-
-
 def choose_held_out(names: Sequence[str]) -> list[str]:
     """Return the views that are held out: those of every 8th panorama. The views of one place show
     the same, so that one alone would be no test."""
@@ -130,12 +123,13 @@ def name_views(photo: Photo, rig: PanoramaRig, target: Path, nadir: float) -> li
 
 def cut(photo: Photo, file: Path, views: Sequence[Photo], target: Path, nadir: float) -> None:
     """Write the views of a panorama and their masks."""
+    orientation = photo.orientation if photo.orientation in (2, 3, 4) else 1  # others would not be panoramas
     with opening_picture(file, CAPTURED, heic=True) as image:
         exif, profile = image.getexif(), image.info.get("icc_profile")
-        lifted = lift(image, photo.white)
+        lifted = turn_upright(lift(image, photo.white), orientation)
         pixels = np.asarray((to_8_bit(lifted, photo.white) if is_deep(lifted.mode) else lifted).convert("RGB"))
     exif.pop(ORIENTATION, None)
-    counts = np.asarray(read_stored_mask(photo).convert("L")) if photo.mask else None
+    counts = np.asarray(turn_upright(read_stored_mask(photo), orientation).convert("L")) if photo.mask else None
     for view, made in zip(VIEWS, views):
         side = made.size[0]
         picture = Image.fromarray(sample(pixels, find_places(view, side, pixels.shape[1::-1])))

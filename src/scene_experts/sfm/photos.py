@@ -274,9 +274,7 @@ def copy_photos(photos: Sequence[Photo], source: Path, target: Path, keep: Colle
 
 def copy_mask(photo: Photo, new: Path) -> None:
     """Write the mask of `photo` upright, 255 where pixels count."""
-    mask = read_stored_mask(photo)
-    mask.getexif()[ORIENTATION] = photo.orientation
-    upright = ImageOps.exif_transpose(mask)
+    upright = turn_upright(read_stored_mask(photo), photo.orientation)
     upright.getexif().clear()
     write_atomic(new, lambda temporary: upright.save(temporary, "PNG"))
 
@@ -290,9 +288,14 @@ def read_stored_mask(photo: Photo) -> Image.Image:
     assert photo.mask is not None
     mask, (width, height) = read_mask(photo.mask), photo.size
     if photo.orientation in (5, 6, 7, 8) and (mask.width > mask.height) != (width > height):
-        mask.getexif()[ORIENTATION] = {6: 8, 8: 6}.get(photo.orientation, photo.orientation)
-        mask = ImageOps.exif_transpose(mask)
+        mask = turn_upright(mask, {6: 8, 8: 6}.get(photo.orientation, photo.orientation))
     return mask
+
+
+def turn_upright(image: Image.Image, orientation: int) -> Image.Image:
+    """Return a picture as it is shown with an orientation of EXIF, 1 to 8."""
+    image.getexif()[ORIENTATION] = orientation
+    return ImageOps.exif_transpose(image)
 
 
 def transfer(old: Path, new: Path, orientation: int, suffix: str = "", white: White | None = None) -> None:
@@ -305,8 +308,7 @@ def transfer(old: Path, new: Path, orientation: int, suffix: str = "", white: Wh
     with opening_picture(old, CAPTURED, heic=True) as image:
         form = {".jpg": "JPEG", ".png": "PNG"}.get(suffix) or ("JPEG" if image.format == "MPO" else image.format)
         image = image if white is None else lift(image, white)
-        image.getexif()[ORIENTATION] = orientation
-        upright = ImageOps.exif_transpose(image)
+        upright = turn_upright(image, orientation)
         exif, upright = upright.getexif(), to_8_bit(upright, white) if is_deep(upright.mode) else upright
         profile = None if is_deep(image.mode) else image.info.get("icc_profile")
     if form == "JPEG":

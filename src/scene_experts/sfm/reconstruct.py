@@ -22,6 +22,7 @@ from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.extras import install_line
 from scene_experts.core.io import read_json, write_bytes, write_json
 from scene_experts.core.progress import Progress
+from scene_experts.data.equirectangular import find_place
 from scene_experts.data.match import EXTENSIONS
 from scene_experts.data.readers import is_capture
 from scene_experts.native import library as native
@@ -32,7 +33,7 @@ from scene_experts.sfm.learned.photographs import Shots
 from scene_experts.sfm.masks import write_masks
 from scene_experts.sfm.options import SfmOptions
 from scene_experts.sfm.pairs import choose_pairs, find_alike
-from scene_experts.sfm.panoramas import PanoramaRig, choose_held_out, cuts, find_place, take_photos
+from scene_experts.sfm.panoramas import PanoramaRig, choose_held_out, cuts, take_photos
 from scene_experts.sfm.photos import Photo
 
 LOG, VIDEO, FRAMES = "colmap.log", "video.txt", "frames"

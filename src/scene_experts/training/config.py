@@ -71,6 +71,9 @@ class Train:
     mean_background: bool = False
     """Put the mean colour of the training photographs behind what none of them shows, unless
     --background names a colour or the photographs are transparent or masked."""
+    near_share: Annotated[float, Range(0, 1)] = 0.0
+    """Draw nothing nearer than this share of the least depth that the training photographs show,
+    unless --near says so: what lies there is fog. 0: --near has its default."""
     exposure: bool = False
     """Learn the exposure and white balance of each training photograph. The scene is that of their
     mean; `eval` draws a held-out view at the exposure of the photographs near it."""

@@ -8,7 +8,8 @@ finite in a moment stays so, and is found later. Every save scans the whole stat
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import torch
@@ -39,6 +40,17 @@ def check_state(tensors: dict[str, Tensor], step: int, folder: Path | None) -> N
     for name, tensor in tensors.items():
         if not are_finite([tensor]):
             raise RunError(explain(f"'{name}'", step, folder))
+
+
+def check_finite(step: int, parts: Mapping[str, Tensor]) -> None:
+    """Check the losses before saving. Raises RunError if one is not finite, so that the last valid
+    checkpoint is kept."""
+    bad = [name for name, value in parts.items() if not math.isfinite(value)]
+    if bad:
+        raise RunError(
+            f"expected finite losses, found {', '.join(bad)} = {float(parts[bad[0]])} at iteration {step}; "
+            "the last checkpoint is intact: look at the capture with `scene-experts info`, or lower the learning rates (--rates...)"
+        )
 
 
 def explain(what: str, step: int, folder: Path | None) -> str:

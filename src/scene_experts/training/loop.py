@@ -4,17 +4,15 @@ any method."""
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from scene_experts.core.errors import InputError, RunError
-from scene_experts.core.group import Alone
+from scene_experts.core.errors import RunError
 from scene_experts.core.schedule import passes
 from scene_experts.core.types import Camera, Mode
 from scene_experts.data.capture import Capture
@@ -24,45 +22,22 @@ from scene_experts.scene.anchors.quantise import ROUNDED
 from scene_experts.scene.poses import at_pose, attach
 from scene_experts.strategy.survey import Survey, TrainingPhoto
 from scene_experts.training.batch import Direct, check_batch, make_exchange
-from scene_experts.training.config import RunConfig, Train, find_unused
+from scene_experts.training.config import Train
 from scene_experts.training.direct import DirectStep
 from scene_experts.training.events import Densified, Event, Finished, Previewed, Saved, Started, Stopped
-from scene_experts.training.guard import explain, find_broken
+from scene_experts.training.guard import check_finite, explain, find_broken
+from scene_experts.training.job import Job, last_iteration
 from scene_experts.training.losses import Sample, compute_terms
 from scene_experts.training.measure import Iteration, measure_step
 from scene_experts.training.memory import anchor_cap, give_back, peak_bytes
-from scene_experts.training.options import TrainOptions
 from scene_experts.training.resident import AHEAD, Resident
 from scene_experts.training.sensitivity import MOST_VIEWS, evenly, find_sensitivity
 from scene_experts.training.shards import Sharded, check_shard
-from scene_experts.training.start import start
-from scene_experts.training.state import Training, resume, save
+from scene_experts.training.start import begin
+from scene_experts.training.state import Training, save
 from scene_experts.training.trial import fit_memory
 
 log: logging.Logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Job:
-    """A training to be done: what is trained, where and how. `config` has the settings that results
-    depend on."""
-
-    config: RunConfig  # with `stop_at`, `max_memory` and `init_from`
-    out: Path | None = None  # the run folder; None writes no files
-    device: str = "cpu"
-    dtype: torch.dtype = torch.float32  # float64 is for tests of rounding errors with the reference rasteriser
-    options: TrainOptions = TrainOptions(preview_every=0)
-    keep: int = 2  # number of checkpoints to keep
-    begin: Callable[[Training], None] = lambda training: None  # called once, before the first event
-    watch: Callable[[Training], None] = lambda training: None  # called between iterations and not timed; the viewer renders here
-    shard: bool = False  # divide the rows of the table among the processes
-    group: Alone = field(default_factory=Alone)  # the processes that share the views of each batch; process 0 writes all files
-    stop: list[str] = field(default_factory=list)  # append a reason to save and stop, for example from a signal handler
-
-    @property
-    def max_memory(self) -> float:
-        """GiB of memory at which densification stops; 0: no limit."""
-        return self.config.max_memory
 
 
 def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iterator[Event]:
@@ -86,7 +61,7 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
     cfg = cfg.scaled()
     folder = run.out / "checkpoints" if run.out else None
     rasterize = for_training(rasterize, cfg.growth.absolute)
-    training = run.group.agree(lambda: begin(cfg, run, capture, folder, rasterize))
+    training = run.group.agree(lambda: _begin(cfg, run, capture, folder, rasterize))
     exchange = start_exchange(training, run)
     total = last_iteration(cfg, run)
     writes = folder is not None and run.group.first
@@ -138,34 +113,8 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
         yield Finished(training.step, training.clock.seconds)
 
 
-def last_iteration(cfg: Train, run: Job) -> int:
-    """Return the iteration at which a training ends: `stop_at` at the end of its batch, or all
-    iterations."""
-    return min(cfg.iterations, -(-(run.config.stop_at or cfg.iterations) // cfg.batch) * cfg.batch)
-
-
-def begin(cfg: Train, run: Job, capture: Capture, folder: Path | None, rasterize: Rasterizer) -> Training:
-    """Start a training, or restore it from the newest whole checkpoint in `folder`. `cfg` must be
-    scaled. Raises InputError as `train`."""
-    training = resume(cfg, folder, run.device) if run.options.resume and folder else None
-    if training and training.capture_id not in ("", capture.fingerprint()):
-        raise InputError(f"expected the capture that this run was trained on, found other views in {capture.root}; give the right --data")
-    if training:
-        capture.expect_poses(training.poses, folder and folder.parent)
-    if training and training.chosen not in (None, capture.chosen()):
-        raise InputError("expected the training views that this run began with, found others; restore the file of --views, or train anew")
-    if training is None and run.config.init_from is not None:
-        training = Training.start_from(cfg, run.config.init_from, capture, run.device, run.config)
-        if run.config.data.init == "dense":
-            log.warning("--init dense has no effect with --init-from, whose scene is there already; leave it out")
-        if training.step >= last_iteration(cfg, run):
-            found = f"found {run.config.stop_at}; give a larger number or leave it out"
-            raise InputError(f"expected --stop-at above {training.step}, where the run of --init-from ended, {found}")
-    training = training or start(cfg, run.config.data, capture, run.device, run.dtype)
-    if unused := find_unused(cfg):
-        log.warning("these options have no effect with this recipe: %s; leave them out", ", ".join(unused))
-    training.capture_id, training.poses, training.chosen = capture.fingerprint(), capture.poses(), capture.chosen()
-    training.scene.set_training_cameras([capture.views[i].camera for i in capture.train])
+def _begin(cfg: Train, run: Job, capture: Capture, folder: Path | None, rasterize: Rasterizer) -> Training:
+    training = begin(cfg, run, capture, folder)
     if run.max_memory > 0:
         fit_memory(training, run.max_memory, capture, lambda *view: see_view(training, run, capture, rasterize, *view))
     return training
@@ -350,17 +299,6 @@ def without_graph(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         return replace(value, **{f.name: without_graph(getattr(value, f.name)) for f in fields(value) if f.init})
     return value
-
-
-def check_finite(step: int, parts: Mapping[str, Tensor]) -> None:
-    """Check the losses before saving. Raises RunError if one is not finite, so that the last valid
-    checkpoint is kept."""
-    bad = [name for name, value in parts.items() if not math.isfinite(value)]
-    if bad:
-        raise RunError(
-            f"expected finite losses, found {', '.join(bad)} = {float(parts[bad[0]])} at iteration {step}; "
-            "the last checkpoint is intact: look at the capture with `scene-experts info`, or lower the learning rates (--rates...)"
-        )
 
 
 @torch.no_grad()

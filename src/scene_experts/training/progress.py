@@ -4,21 +4,36 @@ there is no terminal."""
 from __future__ import annotations
 
 import time
-from collections import deque
 from pathlib import Path
 
+import torch
 from rich.console import Console
 from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as TaskBar
 from rich.text import Text
 
+from scene_experts.core.progress import Speedometer
 from scene_experts.scene import Traits
 from scene_experts.training.events import Densified, Event, Exported, Finished, Previewed, Saved, Started, Stepped, Stopped
 
 SMOOTHING = 0.9  # weight of the previous value in the running means of loss and PSNR
-RECENT = 30.0  # seconds whose speed is shown and extrapolated: a scene that grows slows down
-TICK = 0.5  # seconds between the times that are kept for it
+
+
+GROWN = 1.2
+"""How much more an iteration costs once a scene has grown, in the second half: a whole training
+then takes 1.7 times ten first tenths (`making.budget.GROWTH`)."""
+
+
+def count_left(step: int, total: int) -> float:
+    """Return how many iterations as long as the present one are left. On the CPU those of a growing
+    scene become longer; on CUDA that is not measured, and they count alike."""
+    if torch.cuda.is_available():
+        return total - step
+    grown = lambda share: 1 + GROWN * min(2 * share, 1.0)  # noqa: E731
+    spent = lambda share: share + GROWN * (min(share, 0.5) ** 2 + max(0.0, share - 0.5))  # noqa: E731
+    done = step / total
+    return total * (spent(1.0) - spent(done)) / grown(done)
 
 
 class TrainingProgress:
@@ -43,7 +58,7 @@ class TrainingProgress:
     psnr: float | None
     traits: Traits
     pictured: bool
-    times: deque[tuple[float, int]]
+    pace: Speedometer
 
     def __init__(self, console: Console, every: float = 15.0, out: Path | None = None) -> None:
         self.console, self.every, self.out, self.pictured = console, every, out, False
@@ -51,7 +66,7 @@ class TrainingProgress:
         self.total, self.first, self.began, self.printed = 0, 0, time.perf_counter(), 0.0
         self.loss, self.psnr = {}, None
         self.traits = Traits("", "rows")
-        self.times = deque()
+        self.pace = Speedometer()
 
     def __enter__(self) -> TrainingProgress:
         if self.live:
@@ -67,7 +82,7 @@ class TrainingProgress:
         match event:
             case Started():
                 self.total, self.first, self.began = event.total, event.step, time.perf_counter()
-                self.times = deque([(self.began, event.step)])
+                self.pace = Speedometer()
                 verb = f"resumed at iteration {event.step:,}" if event.step else "started"
                 self.traits, rows = event.traits, event.traits.rows
                 lattice = f" on a lattice of {event.traits.voxel:.3g}" if event.traits.voxel else ""
@@ -110,30 +125,18 @@ class TrainingProgress:
         for name, value in event.terms.items():
             self.loss[name] = SMOOTHING * self.loss.get(name, value) + (1 - SMOOTHING) * value
         self.psnr = event.psnr if self.psnr is None else SMOOTHING * self.psnr + (1 - SMOOTHING) * event.psnr
-        speed = self.find_speed(event.step)
-        left = (self.total - event.step) / max(speed, 1e-9)
+        speed = self.pace(event.step)
+        left = "-:-- left" if speed is None else f"{format_duration(count_left(event.step, self.total) / speed)} left  {speed:.1f} it/s"
         terms = " ".join(f"{name} {value:.4f}" for name, value in self.loss.items())
         active = f"active {100 * event.active:.0f} %  " if self.traits.activation else ""
         line = (  # a narrow terminal cuts the end off
-            f"{event.step:>6,}/{self.total:,}  {format_duration(left)} left  {speed:.1f} it/s  training PSNR {self.psnr:.2f}  "
-            f"{self.traits.rows} {event.anchors:,}  {active}{terms}"
+            f"{event.step:>6,}/{self.total:,}  {left}  training PSNR {self.psnr:.2f}  {self.traits.rows} {event.anchors:,}  {active}{terms}"
         )
         if self.live:
             self.live.update(Text(line, no_wrap=True, overflow="ellipsis"))
         elif time.perf_counter() - self.printed > self.every or event.step == self.total:
             self.printed = time.perf_counter()
             self.print_line(line)
-
-    def find_speed(self, step: int) -> float:
-        """Return the iterations per second of the last RECENT seconds, until iteration `step`
-        now."""
-        now, times = time.perf_counter(), self.times
-        while len(times) > 1 and now - times[1][0] >= RECENT:
-            times.popleft()
-        began, first = times[0]
-        if now - times[-1][0] >= TICK:
-            times.append((now, step))
-        return (step - first) / max(now - began, 1e-9)
 
     def print_line(self, text: str) -> None:
         """Print a line above the line that is updated in place."""
@@ -156,12 +159,15 @@ class ProgressBar:
     printed: float
     bar: TaskBar
     task: TaskID
+    what: str
+    pace: Speedometer
 
     def __init__(self, console: Console, every: float = 15.0) -> None:
         self.console, self.every, self.printed = console, every, time.monotonic()
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
         self.bar = TaskBar(*columns, console=console, transient=True)
         self.task = self.bar.add_task("opening", total=None)
+        self.what, self.pace = "", Speedometer()
 
     def __enter__(self) -> ProgressBar:
         if self.console.is_terminal:
@@ -174,10 +180,15 @@ class ProgressBar:
 
     def __call__(self, what: str, done: int, total: int) -> None:
         """Show that `done` of `total` parts of the work `what` are done."""
+        if what.partition(" (")[0] != self.what.partition(" (")[0]:  # another work: the speed of the last one says nothing
+            self.pace = Speedometer()
+            self.bar.reset(self.task)
+        self.what, speed = what, self.pace(done)
         self.bar.update(self.task, description=what, completed=done, total=total)
         if not self.console.is_terminal and time.monotonic() - self.printed > self.every:
             self.printed = time.monotonic()
-            self.console.print(f"{what}: {done} of {total}", highlight=False, soft_wrap=True)
+            left = "" if speed is None or "left" in what else f", about {format_duration(max(0, total - done) / speed)} left"
+            self.console.print(f"{what}: {done} of {total}{left}", highlight=False, soft_wrap=True)
 
 
 def format_duration(seconds: float) -> str:

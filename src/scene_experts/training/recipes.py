@@ -84,6 +84,7 @@ def _for_photographs(name: str) -> Train:
         scene=replace(plain.scene, few_fall=AFTER_GROWTH),
         dense_views=FEW,
         mean_background=True,
+        near_share=0.5,
         random_background=True,
         random_background_from=AFTER_GROWTH[0],
     )

@@ -198,13 +198,15 @@ def prepare(out: Path, config: RunConfig, resume: bool, overwrite: bool = False,
 
 def as_begun(out: Path, config: RunConfig) -> RunConfig:
     """Return the configuration with what the run in `out` decided where it decides nothing itself:
-    `init_from`, and the background of `train.mean_background`. Unchanged if there is no run. For a
-    run to resume."""
+    `init_from`, the background of `train.mean_background` and the near plane of `train.near_share`.
+    Unchanged if there is no run. For a run to resume."""
     if not (out / "config.json").is_file():
         return config
     begun = read_config(out)
     if config.train.mean_background and config.data.background is None:
         config = replace(config, data=replace(config.data, background=begun.data.background))
+    if config.train.near_share and config.data.near is None:
+        config = replace(config, data=replace(config.data, near=begun.data.near))
     return config if config.init_from is not None else replace(config, init_from=begun.init_from)
 
 

@@ -14,7 +14,7 @@ from scene_experts.render import choose
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Exported, Finished, Previewed, Saved, Started, Stopped
-from scene_experts.training.loop import Job
+from scene_experts.training.job import Job
 from scene_experts.training.options import TrainOptions
 from scene_experts.training.recipes import RECIPES
 from support.captures import load

@@ -12,8 +12,8 @@ def test_the_measured_picture_takes_time():
 def test_twice_the_iterations_take_twice_the_time_and_threads_save_some():
     one, two = (advice.estimate_minutes(800, 600, n, 0.015, 1) for n in (1000, 2000))
     assert two == pytest.approx(2 * one)
-    # 2,000 iterations x 15 ms x (4.5 + 9.8 x 0.48) = 276 s
-    assert two == pytest.approx(276.12 / 60)
+    # 2,000 iterations x 15 ms x (5 + 9.5 x 0.48 x 0.48 / 1.08) = 210.8 s
+    assert two == pytest.approx(210.8 / 60)
     assert advice.estimate_minutes(800, 600, 1000, 0.015, 2) == pytest.approx(one * (0.15 + 0.85 / 2))
 
 
@@ -41,4 +41,11 @@ def test_few_photographs_get_a_shorter_training():
 def test_the_time_is_below_the_limit_where_that_can_be(picture):
     found = advice.suggest(4000, 3000, 100, picture)
     assert found.minutes <= advice.LIMIT or found.flags == advice.suggest(4000, 3000, 100, 10.0).flags
-    assert "min on this machine" in str(found)
+
+
+def test_a_busy_machine_is_told_with_its_share():
+    found = advice.Advice(800, 4000, 6.0)
+    assert found.tell(1.0) == "about 6 min on this machine"
+    assert "about 15 min beside" in found.tell(0.4) and "about 6 min alone" in found.tell(0.4)
+    assert advice.Advice(0, 30_000, None).tell(0.5) == ""
+    assert advice.Advice(800, 300, 0.52).tell(0.5) == "about 60 s beside what else this machine does now (about 30 s alone)"

@@ -19,6 +19,15 @@ def test_rates_are_plausible():
     assert 1e8 < machine.measure_clock(native.load().level, 0.0) < 2e10
 
 
+def test_more_busy_threads_than_cores_share_them(monkeypatch):
+    cores = native.count_cores()
+    monkeypatch.setattr(machine, "load_average", lambda: 0.0)
+    assert machine.measure_share(cores, 0.0) == 1
+    monkeypatch.setattr(machine, "load_average", lambda: None)
+    assert 0 < machine.measure_share(1, 0.1) <= 1
+    assert machine.measure_share(4 * cores, 0.2) < 0.5
+
+
 def test_wider_vectors_multiply_faster():
     levels = [level for level in native.list_levels() if native.find(level)]
     if not {"portable", "avx2"} <= set(levels):

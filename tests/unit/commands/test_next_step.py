@@ -9,7 +9,8 @@ from scene_experts.commands.train import parse_train
 from scene_experts.data.settings import Data
 
 
-def test_the_command_is_one_of_train_with_its_time():
+def test_the_command_is_one_of_train_with_its_time(monkeypatch):
+    monkeypatch.setattr("scene_experts.bench.machine.measure_share", lambda threads: 1.0)
     line = propose_training(Data(Path("a folder")), 640, 480, 50)
     assert line.startswith("next: scene-experts train one-network --data 'a folder' --out RUN") and "min on this machine" in line
     words = shlex.split(line.partition("  #")[0])[3:]

@@ -13,6 +13,7 @@ import torch
 from PIL import Image
 
 from scene_experts.core.errors import InputError
+from scene_experts.data.equirectangular import VIEWS
 from scene_experts.data.lens import Lens
 from scene_experts.data.readers.colmap_model import read_model, write_model
 from scene_experts.data.summary import neighbour_distance, summarise
@@ -187,6 +188,18 @@ def test_a_name_of_two_photographs_is_refused(copy: Path) -> None:
     assert load(copy, leave_out=("b/one",)).omitted == ("b/one.png",)
     with pytest.raises(InputError, match=naming("a/one.png, b/one.png", "folder")):
         load(copy, leave_out=("one",))
+
+
+def test_the_views_of_a_panorama_are_left_out_together(copy: Path) -> None:
+    model = read_model(copy / "sparse" / "0")
+    first, second, *others = model.images
+    names = [f"{view.folder}/pano.png" for view in VIEWS[:2]]
+    for name, image in zip(names, (first, second)):
+        (copy / "images" / name).parent.mkdir()
+        shutil.move(copy / "images" / image.name, copy / "images" / name)
+    write_model(copy / "sparse" / "0", replace(model, images=(*(replace(i, name=n) for i, n in zip((first, second), names)), *others)))
+    assert load(copy, leave_out=("pano.png",)).omitted == tuple(sorted(names))
+    assert load(copy, leave_out=(names[0],)).omitted == (names[0],)
 
 
 def test_images_of_another_shape(copy: Path) -> None:

@@ -28,7 +28,8 @@ from scene_experts.render import choose
 from scene_experts.scene.anchors.features import FeatureBank
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig, Train
-from scene_experts.training.loop import Job, train
+from scene_experts.training.job import Job
+from scene_experts.training.loop import train
 from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training
 from support.files import export_run

@@ -23,7 +23,8 @@ from scene_experts.files.scene_folder import write_result_folder
 from scene_experts.render import choose
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
-from scene_experts.training.loop import Job, train
+from scene_experts.training.job import Job
+from scene_experts.training.loop import train
 from scene_experts.training.recipes import RECIPES
 from support.files import export_run
 from support.messages import naming

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from scene_experts.geometry.poses import catmull_rom, exp_motion, interpolate_poses, look_at, make_pose, slerp, with_fov
+from scene_experts.geometry.poses import catmull_rom, exp_motion, interpolate_poses, log_motion, look_at, make_pose, slerp, with_fov
 from scene_experts.geometry.rotation import quat_to_matrix
 from support.scenes import CAMERA
 
@@ -70,3 +70,9 @@ def test_exp_motion_is_a_rotation_about_an_axis_and_a_translation():
     )
     moved = exp_motion(torch.tensor([0.0, 0, 0, 1, 2, 3], dtype=torch.float64))
     assert torch.equal(moved[:3, 3], torch.tensor([1.0, 2, 3], dtype=torch.float64))
+
+
+def test_the_twist_of_a_motion_is_found_again():
+    twist = torch.tensor([0.4, -1.2, 0.7, 3.0, 0.1, -2.0], dtype=torch.float64)
+    assert torch.allclose(log_motion(exp_motion(twist)), twist)
+    assert torch.allclose(log_motion(torch.eye(4)), torch.zeros(6, dtype=torch.float64))

@@ -1,15 +1,18 @@
 """A page from photographs: which stages run, with what, and what a repeated call does."""
 
 import json
-from dataclasses import replace
+import signal
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import pytest
 
 from scene_experts.bench.advice import Advice
+from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
 from scene_experts.making import make as making
-from scene_experts.making.make import make
+from scene_experts.making.make import TrainingPlan, make
+from scene_experts.sfm.options import SfmOptions, SourceOptions
 from scene_experts.training.events import Stepped
 from scene_experts.training.recipes import PROPOSED
 from support.messages import naming
@@ -33,7 +36,7 @@ def trained(monkeypatch):
     class Trainer:
         seconds = 0.01
 
-        def __init__(self, recipe, capture, folder, resume, overwrite, preview_every):
+        def __init__(self, recipe, capture, folder, resume, overwrite, preview_every, save_every):
             self.recipe, self.capture, self.folder, self.stopped = recipe, capture, folder, False
             self.resume, self.run = (
                 resume,
@@ -60,8 +63,13 @@ def trained(monkeypatch):
     monkeypatch.setattr(making, "Trainer", Trainer)
     monkeypatch.setattr(making, "export_several", export)
     monkeypatch.setattr(making.run_folder, "open_run", lambda folder: None)
-    plan = lambda width, height, views, have, slow=1.0: Advice(0, 1000 if have is None or slow == 1 else round(have / slow * 10), 1.0)  # noqa: E731
+
+    def plan(width, height, views, have, slow=1.0):
+        iterations = 1000 if have is None or slow == 1 else round(have / slow * 10)
+        return Advice(0, iterations, iterations / 1000)
+
     monkeypatch.setattr(making, "plan_training", plan)
+    monkeypatch.setattr(making, "measure_share", lambda threads: 1.0)
     return SimpleNamespace(made=made, Trainer=Trainer)
 
 
@@ -92,6 +100,13 @@ def test_a_training_that_would_not_fit_begins_anew_with_other_iterations(capture
     assert second.recipe.iterations == pytest.approx(75 / (170 / 60) * 10, rel=0.02)  # 15 of 90 s are the page's; 170 s for 1 min
 
 
+def test_a_training_is_not_begun_anew_for_one_that_ends_later(capture, tmp_path):
+    whole = TrainingPlan(tmp_path, "none", (48, 32), None, SimpleNamespace(iterations=320), Advice(0, 320, 0.32))
+    shortest = replace(whole, advice=Advice(0, 300, 0.3), slow=4.0)
+    assert not whole.pays(shortest, 32) and whole.pays(shortest, 10)
+    assert whole.pays(replace(shortest, advice=Advice(0, 900, 0.9), slow=0.5), 32)
+
+
 def test_a_repeated_call_continues_the_training_and_keeps_the_page(capture, tmp_path, trained, monkeypatch):
     made = make(capture, tmp_path / "out", say=lambda _: None)
     begun = SimpleNamespace(data=SimpleNamespace(split="none", resolution="auto"), train=replace(trained.made[0].recipe, iterations=500))
@@ -108,18 +123,56 @@ def test_photographs_get_poses_first(tmp_path, capture, trained, monkeypatch):
     asked = []
 
     def reconstruct(source, out, options, say, progress):
-        asked.append(out)
+        asked.append((out, options))
         make_capture(out, views=9, size=(48, 32), points=200)
-        return {"with_pose": 9, "photographs": 9, "points": 200}
+        (out / "capture.json").write_text(json.dumps({"options": asdict(options)}))
+        return {"with_pose": 9, "photographs": 10, "points": 200, "without_pose": ["a.jpg"], "apart": [], "all_compared": True}
 
     monkeypatch.setattr(making, "reconstruct", reconstruct)
     (tmp_path / "photos").mkdir()
+    said, options = [], SourceOptions(nadir=20.0)
     for _ in range(2):
-        made = make(tmp_path / "photos", tmp_path / "out", say=lambda _: None)
-    assert asked == [tmp_path / "out" / "capture"] and made.capture == asked[0]
+        made = make(tmp_path / "photos", tmp_path / "out", options=options, say=said.append)
+    assert asked == [(tmp_path / "out" / "capture", SfmOptions(nadir=20.0))] and made.capture == asked[0][0]
+    assert "photographs without a pose: a.jpg" in said
+    with pytest.raises(InputError, match=naming("--nadir 20.0")):
+        make(tmp_path / "photos", tmp_path / "out", say=lambda _: None)
     (tmp_path / "others").mkdir()
     with pytest.raises(InputError, match=naming(tmp_path / "others")):
         make(tmp_path / "others", tmp_path / "out", say=lambda _: None)
+
+
+def test_a_capture_has_its_poses(capture, tmp_path):
+    with pytest.raises(InputError, match="--panoramas"):
+        make(capture, tmp_path / "out", options=SourceOptions(panoramas="keep"))
+
+
+def test_a_repeated_call_says_how_far_the_training_is(tmp_path):
+    config = SimpleNamespace(train=SimpleNamespace(iterations=500), data=SimpleNamespace(resolution="auto"))
+    assert "at iteration 0" in making.describe_begun(tmp_path, config)
+    checkpoint.save(tmp_path / "checkpoints", 500, {}, {})
+    told = making.describe_begun(tmp_path, config)
+    assert "is complete: 500" in told and "--minutes" in told and str(tmp_path) in told
+
+
+def test_an_interrupted_training_is_saved_first(capture, tmp_path, trained, monkeypatch):
+    class Interrupted(trained.Trainer):
+        def __iter__(self):
+            for event in super().__iter__():
+                if event.step == 50:
+                    signal.raise_signal(signal.SIGINT)
+                yield event
+
+    monkeypatch.setattr(making, "Trainer", Interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        make(capture, tmp_path / "out", say=lambda _: None)
+    assert trained.made[0].stopped and not (tmp_path / "out" / "scene.html").exists()
+
+
+def test_photographs_that_are_not_there_leave_no_folder(tmp_path):
+    with pytest.raises(InputError, match="none"):
+        make(tmp_path / "none", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_no_time_is_no_budget(tmp_path):

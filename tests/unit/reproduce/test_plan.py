@@ -64,6 +64,13 @@ def test_what_changes_numbers_changes_the_key_and_the_place_does_not():
     assert replace(spec, scene=replace(FOX, path=Path("/elsewhere/fox"))).key == spec.key
 
 
+def test_a_background_that_the_recipe_computes_does_not_change_the_key():
+    own, black = RECIPES["one-network"][1], RECIPES["scaffold-gs"][1]
+    planned, trained = Data(Path("fox")), Data(Path("fox"), background=(0.5, 0.4, 0.3))
+    assert identity("fox", own, planned) == identity("fox", own, trained)
+    assert identity("fox", black, planned) != identity("fox", black, trained)
+
+
 def test_a_setting_counts_where_it_differs_from_its_default_and_a_part_where_it_changed(monkeypatch):
     cfg = Spec(FOX, "moe-gs", 0, Scale()).train
     name = identity("fox", cfg, Data(FOX.path))

@@ -137,6 +137,20 @@ def test_other_motions_stay_and_held_out_cameras_do_not_move():
     assert "degrees" in made.describe()
 
 
+def test_poses_begin_at_adjusted_cameras_and_keep_what_moves_all_of_them():
+    made, given = poses(), [camera_at(3 * i, i) for i in range(5)]
+    world = exp_motion(torch.tensor([0.02, 0.01, -0.01, 0.1, 0.2, 0.0], dtype=torch.float64))  # a motion of the whole world
+    adjusted = [at_pose(camera, camera.world_to_cam.double() @ world) for camera in given]
+    made.begin_at(given, adjusted)
+    for camera, other in zip(given, adjusted):
+        torch.testing.assert_close(made.refine(camera).world_to_cam, other.world_to_cam, rtol=0, atol=1e-5)
+    again = Poses.restore(made.tensors())
+    assert again is not None and torch.equal(again.without_gauge(), made.without_gauge())
+    later = poses()
+    later.continue_from(made)
+    torch.testing.assert_close(later.without_gauge(), made.without_gauge())
+
+
 def test_poses_start_where_they_are():
     camera = camera_at(6, 2)
     assert torch.equal(poses().refine(camera).world_to_cam, camera.world_to_cam)

@@ -7,7 +7,7 @@ from PIL import Image
 from scene_experts.core.io import write_json
 from scene_experts.data.lens import Lens
 from scene_experts.data.readers.colmap_model import ColmapImage, Model
-from scene_experts.sfm.drift import DRIFT, GAMMA, KEY, NOTE, drifts, find_stops
+from scene_experts.sfm.drift import DRIFT, GAMMA, KEY, NOTE, drifts, find_stops, warn_of_steady
 
 WIDTH, HEIGHT = 64, 48
 
@@ -48,3 +48,10 @@ def test_what_capture_measured_decides(tmp_path):
         assert drifts(tmp_path) is told
     (tmp_path / NOTE).write_text("[]")
     assert not drifts(tmp_path)
+
+
+def test_a_training_on_steady_exposures_is_warned(tmp_path):
+    assert warn_of_steady(tmp_path) is None  # nothing was measured
+    for value, told in ((0.05, True), (0.29, True), (DRIFT, False), (None, False)):
+        write_json(tmp_path / NOTE, {KEY: value})
+        assert ("--exposure" in (warn_of_steady(tmp_path) or "")) is told

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scene_experts.data.equirectangular import VIEWS
+from scene_experts.data.equirectangular import VIEWS, find_place
 from scene_experts.sfm import reconstruct as run
 from scene_experts.sfm.options import SfmOptions
-from scene_experts.sfm.panoramas import PanoramaRig, choose_held_out, cut_panoramas, find_place
+from scene_experts.sfm.panoramas import PanoramaRig, choose_held_out, cut_panoramas
 from scene_experts.sfm.photos import find_photos
 from support.captures import load
 from support.rooms import draw_panorama, paint_walls
@@ -57,6 +57,21 @@ def test_masks_are_cut_like_their_panoramas_and_leave_the_nadir_out(tmp_path):
     assert below[20, 20] == 255 and below[-1, 20] == 0
     without, _ = cut_panoramas(find_photos(source), source, target)
     assert {view.name for view in without if view.mask} == {view.name for view in views if view.name.endswith("/1.jpg")}
+
+
+def test_an_upside_down_panorama_is_turned_by_its_exif(tmp_path):
+    source = write_panoramas(tmp_path / "in")
+    upright, _ = cut_panoramas(find_photos(source), source, tmp_path / "upright")
+    with Image.open(source / "1.jpg") as picture:
+        turned, exif = picture.transpose(Image.Transpose.ROTATE_180), picture.getexif()
+    exif[0x0112] = 3
+    turned.save(source / "1.jpg", quality=100, subsampling=0, exif=exif)
+    cut_panoramas(find_photos(source), source, tmp_path / "turned")
+    for view in upright:
+        a, b = (np.asarray(Image.open(tmp_path / folder / view.name), dtype=float) for folder in ("upright", "turned"))
+        assert np.abs(a - b).mean() < 2
+    with Image.open(tmp_path / "turned" / upright[0].name) as picture:
+        assert 0x0112 not in picture.getexif()
 
 
 def test_other_photographs_are_their_own_place():

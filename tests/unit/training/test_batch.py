@@ -17,7 +17,8 @@ from scene_experts.training.batch import check_batch
 from scene_experts.training.config import RunConfig
 from scene_experts.training.config import check as check_train
 from scene_experts.training.events import Densified, Previewed, Started, Stepped, Stopped
-from scene_experts.training.loop import Job, iterate
+from scene_experts.training.job import Job
+from scene_experts.training.loop import iterate
 from scene_experts.training.state import Training
 from support.captures import load
 from support.groups import run_group

@@ -10,7 +10,7 @@ import torch
 
 from scene_experts.core.types import Mode
 from scene_experts.render import choose, for_training
-from scene_experts.scene.anchors import scene as anchors
+from scene_experts.scene.anchors import decode as anchors
 from scene_experts.scene.anchors.routers import Margin
 from scene_experts.scene.anchors.select import Octree
 from scene_experts.scene.poses import attach

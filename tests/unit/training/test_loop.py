@@ -20,7 +20,9 @@ from scene_experts.strategy.split_clone import SplitClone
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Densified, Finished, Previewed, Saved, Started, Stepped, Stopped
-from scene_experts.training.loop import Job, iterate, without_graph
+from scene_experts.training.init_from import start_from
+from scene_experts.training.job import Job
+from scene_experts.training.loop import iterate, without_graph
 from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training
 from support.captures import load
@@ -57,7 +59,7 @@ def test_other_camera_poses_are_refused(folder, tmp_path):
     with pytest.raises(InputError, match=naming(tmp_path / "run", "camera poses")):
         list(events(cfg, other, tmp_path / "run", stop_at=40, resume=True))
     with pytest.raises(InputError, match=naming(tmp_path / "run", "camera poses")):
-        Training.start_from(cfg.scaled(), tmp_path / "run", load(other), "cpu", RunConfig(cfg, Data(other)))
+        start_from(cfg.scaled(), tmp_path / "run", load(other), "cpu", RunConfig(cfg, Data(other)))
 
 
 def test_a_run_goes_on_with_the_training_views_that_it_began_with(folder, tmp_path):

@@ -11,7 +11,8 @@ from scene_experts.data.settings import Data
 from scene_experts.render import choose
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Stepped
-from scene_experts.training.loop import Job, iterate
+from scene_experts.training.job import Job
+from scene_experts.training.loop import iterate
 from scene_experts.training.measure import measure_step
 from scene_experts.training.state import Training
 from support.captures import load

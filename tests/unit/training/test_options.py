@@ -7,7 +7,7 @@ import pytest
 from scene_experts.commands.train import TrainCommand
 from scene_experts.core.errors import InputError
 from scene_experts.core.fields import check_fields
-from scene_experts.training.loop import Job
+from scene_experts.training.job import Job
 from scene_experts.training.options import TrainOptions
 
 

@@ -12,6 +12,7 @@ from scene_experts.geometry.poses import exp_motion
 from scene_experts.scene.poses import Poses
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
+from scene_experts.training.init_from import start_from
 from scene_experts.training.shards import check_shard
 from scene_experts.training.state import Training
 from support.captures import load
@@ -52,7 +53,7 @@ def test_a_training_goes_on_with_the_poses_of_another(folder, tmp_path):
     capture, earlier = load(folder), Poses.restore(last_tensors(tmp_path))
     for refine in (True, False):
         now = replace(cfg, refine_poses=refine)
-        made = Training.start_from(now.scaled(), tmp_path, capture, "cpu", RunConfig(now, Data(folder)))
+        made = start_from(now.scaled(), tmp_path, capture, "cpu", RunConfig(now, Data(folder)))
         torch.testing.assert_close(made.scene.poses.without_gauge(), earlier.without_gauge(), rtol=0, atol=1e-6)
         assert any(g["name"] == "poses" for g in made.optimizer.param_groups) == refine
         assert made.scene.poses.motions.requires_grad == refine

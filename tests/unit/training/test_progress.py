@@ -1,13 +1,15 @@
 import io
 from pathlib import Path
 
+import pytest
 import torch
 from rich.console import Console
 
+from scene_experts.core.progress import Speedometer
 from scene_experts.scene import Traits
 from scene_experts.strategy import Edit
 from scene_experts.training.events import Densified, Exported, Finished, Previewed, Saved, Started, Stepped, Stopped
-from scene_experts.training.progress import ProgressBar, TrainingProgress, format_duration
+from scene_experts.training.progress import GROWN, ProgressBar, TrainingProgress, count_left, format_duration
 
 
 def test_a_log_file_gets_plain_lines():
@@ -28,7 +30,6 @@ def test_a_log_file_gets_plain_lines():
         "training PSNR 21.50",
         "anchors 1,300",
         "active 61 %",
-        "it/s",
         "left",
         "cap on anchors",
         "1:15",
@@ -78,6 +79,28 @@ def test_the_first_picture_has_its_place():
     assert str(Path("runs/a/previews/000500.png")) in out.getvalue() and "001000" not in out.getvalue()
 
 
+def test_the_time_left_is_that_of_the_measured_speed(monkeypatch):
+    out, clock = io.StringIO(), [0.0]
+    monkeypatch.setattr("scene_experts.training.progress.Speedometer", lambda: Speedometer(lambda: clock[0]))
+    with TrainingProgress(Console(file=out, width=200), every=0.0) as show:
+        show(Started(0, 200, 1234, Traits("anchors", "anchors")))
+        for step in (10, 50):
+            show(Stepped(step, {"l1": 0.05}, 21.5, 1300, 800, 4000, 0.61, 1.0, {}))
+            clock[0] += 4.0
+    first, second = [line for line in out.getvalue().splitlines() if "/200" in line]
+    assert "-:-- left" in first and f"{format_duration(count_left(50, 200) / 10)} left  10.0 it/s" in second
+
+
+def test_iterations_of_a_growing_scene_count_more(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    costs = [1 + GROWN * min(2 * i / 1000, 1) for i in range(1000)]
+    for step in (0, 100, 500, 900):
+        assert count_left(step, 1000) == pytest.approx(sum(costs[step:]) / costs[step], rel=0.01)
+    assert sum(costs) / (10 * sum(costs[:100])) == pytest.approx(1.7, abs=0.05) and count_left(1000, 1000) == 0
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert count_left(100, 1000) == 900
+
+
 def test_durations_are_formatted():
     assert [format_duration(s) for s in (0, 59.6, 61, 3661)] == ["0:00", "1:00", "1:01", "1:01:01"]
 
@@ -87,6 +110,16 @@ def test_a_bar_prints_lines_without_a_terminal():
     with ProgressBar(console, every=0.0) as tell:
         tell("rendering", 3, 9)
     assert console.file.getvalue() == "rendering: 3 of 9\n"  # type: ignore[attr-defined]
+    clock = [0.0]
+    with ProgressBar(console, every=0.0) as tell:
+        tell.pace = Speedometer(lambda: clock[0])
+        tell.what = "refining"
+        for done in (100, 200):
+            tell("refining", done, 1000)
+            clock[0] += 5.0
+        tell("measuring", 1, 2)
+    lines = console.file.getvalue().splitlines()[1:]  # type: ignore[attr-defined]
+    assert lines == ["refining: 100 of 1000", "refining: 200 of 1000, about 0:40 left", "measuring: 1 of 2"]
     quiet = Console(file=io.StringIO(), force_terminal=False)
     with ProgressBar(quiet) as tell:
         tell("rendering", 3, 9)

@@ -19,7 +19,8 @@ from scene_experts.render import choose
 from scene_experts.training import recipe_book, run_folder
 from scene_experts.training.config import RunConfig, check
 from scene_experts.training.events import Densified, Finished, Stepped
-from scene_experts.training.loop import Job, train
+from scene_experts.training.job import Job
+from scene_experts.training.loop import train
 from scene_experts.training.options import TrainOptions
 from scene_experts.training.recipe_book import GROUP, RecipeBook
 from scene_experts.training.recipes import RECIPES, moe_gs

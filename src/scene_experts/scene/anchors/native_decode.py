@@ -1,7 +1,7 @@
 """Decode of an anchor scene in the compiled CPU library: gather -> direction -> routing -> experts
 -> Gaussians.
 
-Forward and backward compute the same function as `AnchorScene.decode_composed`, the reference. The
+Forward and backward compute the same function as `DecodingScene.decode_composed`, the reference. The
 anchors of each expert are gathered, so Top-k evaluates k networks per anchor instead of E. The
 backward pass recomputes the hidden layers. Gradients are the same bits for every number of threads.
 Symbols as in `types.py`. A head has D inputs, H hidden units and L middle layers.

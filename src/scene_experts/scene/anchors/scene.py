@@ -13,126 +13,44 @@ import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from types import SimpleNamespace
-from typing import Annotated, Any, Literal, Self, cast
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from scene_experts.core.errors import InputError
-from scene_experts.core.fields import SCALES, Count, CountOrNone, Flag, NotNegative, Range, Scales
 from scene_experts.core.parts import register
 from scene_experts.core.table import Table
-from scene_experts.core.types import Camera, Decoded, Gaussians, Mode, Points, Routing
+from scene_experts.core.types import Camera, Decoded, Mode, Points
 from scene_experts.geometry.neighbours import knn_d2
-from scene_experts.geometry.voxel import VoxelChoice, choose_voxel_size
-from scene_experts.native import library as native
-from scene_experts.native import triton
-from scene_experts.scene import OPACITY, Cull, Draws, LatticeScene, SceneConfig, Traits
-from scene_experts.scene.anchors import native_decode, triton_decode
-from scene_experts.scene.anchors.appearance import Codes, fold
+from scene_experts.geometry.voxel import choose_voxel_size
+from scene_experts.scene import Cull, Draws, Traits
+from scene_experts.scene.anchors.appearance import Codes
+from scene_experts.scene.anchors.decode import DecodingScene
 from scene_experts.scene.anchors.direct import DirectAnchors, explain_uncovered
-from scene_experts.scene.anchors.features import FeatureMix, OwnFeature
 from scene_experts.scene.anchors.few_views import displace, find_spacings, find_weight, left_at
 from scene_experts.scene.anchors.frozen import Frozen, FrozenCuda
-from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, Attribute, Decoder, Head, HeadWeights, Plain
-from scene_experts.scene.anchors.quantise import CLASS, KEEP, OPEN, ROUNDED, STEPS, RowRounding, Steps, settle
-from scene_experts.scene.anchors.select import AllAnchors, Selection, Selector, drop_masked, fade_opacities, visible_rows
+from scene_experts.scene.anchors.mlp import ATTRIBUTES, CHANNELS, Head
+from scene_experts.scene.anchors.quantise import CLASS, KEEP, OPEN, STEPS, Steps, settle
+from scene_experts.scene.anchors.select import AllAnchors, Selector, drop_masked, fade_opacities, visible_rows
+from scene_experts.scene.anchors.settings import AnchorSettings
 from scene_experts.scene.anchors.smoothing import find_intervals, smooth
-from scene_experts.scene.anchors.triton_networks import covers
 
 log: logging.Logger = logging.getLogger(__name__)
 NEARLY_ALL = 0.95  # the lattice has almost no effect if this share of the points is alone in its voxel
-EPS = 1e-12  # keeps directions and quaternions finite if their length is 0
 
 
 @register
 @dataclass(frozen=True)
-class Anchors(SceneConfig):
+class Anchors(AnchorSettings):
     """Settings of a scene of anchors."""
 
     family = "anchors"
 
-    K: Count = 10
-    """Number of Gaussians per anchor."""
-    F: Count = 32
-    """Number of feature channels per anchor."""
-    hidden: Count = 32
-    """Width of the decoder networks."""
-    add_dist: tuple[Attribute, ...] = ()
-    """Attributes whose networks also receive the distance to the camera."""
-    voxel_size: NotNegative = 0.0
-    """Edge of the finest voxels in trained units; 0 lets voxel_rule choose it."""
-    voxel_rule: VoxelChoice = "neighbours"
-    """neighbours: a quarter of the median distance to the nearest neighbours. squared_median and
-    median_nn: the rule of Scaffold-GS as implemented and as documented."""
-    decode: Literal["auto", "composed", "native"] = "auto"
-    """Implementation that decodes anchors: native (fused), composed (PyTorch), or auto (native if
-    it supports the scene)."""
-    decoder: Decoder = Plain()
-    """The networks that turn features into Gaussians."""
-    select: Selection = AllAnchors()
-    """Which anchors a camera uses."""
-    mix: FeatureMix = OwnFeature()
-    """What the decoders see of an anchor's feature."""
-    appearance: CountOrNone = 0
-    """Size of the appearance code per training view; 0 means no codes."""
-    dropout: Annotated[float, Range(0, below=1)] = 0.0
-    """Share of the anchors that a training view leaves out from iteration `dropout_full` on; it
-    rises linearly from 0. Meant for few photographs (after DropGaussian, Park et al. 2025)."""
-    dropout_full: Annotated[int, Range(1), Scales(least=1)] = 30_000
-    """Iteration at which the share of dropped anchors is reached. --iterations rescales it."""
-    view_jitter: NotNegative = 0.0
-    """Training views are decoded as seen from a random position around their camera. Its root mean
-    square distance from the camera, as a share of the distance to the nearest other training
-    cameras; 0 means no displacement."""
-    few_views: CountOrNone = 0
-    """Number of training views up to which dropout and view_jitter have their whole value. Both
-    fall linearly to 0 at twice as many views; 0: the same values for any number of views."""
-    few_fall: Annotated[tuple[int, int], Range(0), SCALES] = (0, 0)
-    """Iterations between which dropout and view_jitter fall linearly to nothing; 0 0: they stay.
-    --iterations rescales them."""
-    smoothing: NotNegative = 0.0
-    """Variance of the 3D smoothing filter in squared pixels of the closest training view (0.2 in
-    Mip-Splatting); 0 means no filter. It helps cameras that come closer than the training views."""
-
-    @property
-    def grown_as(self) -> str:
-        return "anchors on levels" if self.select.has_levels else "anchors"
-
-    @property
-    def dense_until(self) -> int:
-        return self.decoder.dense_until
-
-    @property
-    def can_round(self) -> bool:
-        return True
-
-    @property
-    def has(self) -> frozenset[str]:
-        return self.decoder.has | {OPACITY}
-
-    def phases(self) -> dict[str, int]:
-        return {"decoder.warmup": self.dense_until, **{f"select.{name}": last for name, last in self.select.phases().items()}}
-
-    def needs_whole_table(self) -> str:
-        return "anchors on levels" if self.select.has_levels else ""
-
-    def of_views(self, views: int) -> Self:
-        weight = find_weight(self.few_views, views)
-        fixed = replace(self, few_views=0, dropout=self.dropout * weight, view_jitter=self.view_jitter * weight)
-        return self if weight == 1 else fixed  # 1: with fewer views too
-
     def start(self, points: Points, extent: float, cameras: Sequence[Camera] = ()) -> AnchorScene:
         """Create a scene with one anchor per occupied voxel of the point cloud."""
         return AnchorScene.from_points(self, points, extent, cameras)
-
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        levels: dict[str, tuple[int, ...]] = {"facts.level": (), "facts.extra_level": ()} if self.select.has_levels else {}
-        params = {"params.feature": (self.F,), "params.offsets": (self.K, 3), "params.log_scaling": (6,)}
-        return {**params, "facts.cell": (3,), "facts.xyz": (3,), **levels}
 
     def load(self, table: Table, meta: dict[str, Any]) -> AnchorScene:
         """Create the scene of a checkpoint with newly initialized networks."""
@@ -140,23 +58,15 @@ class Anchors(SceneConfig):
         scene.steps = Steps.from_plain(meta["steps"], self.F, self.K) if "steps" in meta else None
         return scene
 
-    def check(self, flag: Flag) -> None:
-        self.mix.check_size(self.F)
 
-
-class AnchorScene(LatticeScene):
+class AnchorScene(DecodingScene):
     """N anchors with three decoder heads.
 
     Columns: cell [N, 3] int64, xyz [N, 3]; feature [N, F], offsets [N, K, 3], log_scaling [N, 6].
     While a training rounds the values (`start_rounding`): keep [N, K], class [N] int64.
     """
 
-    config: Anchors
-    bank: Any  # the feature bank; None without one
     voxel: float
-    codes: Codes | None
-    steps: Steps | None
-    """Of what a compact file holds; None: no training has learned them."""
 
     def __init__(
         self, config: Anchors, table: Table, voxel: float, extent: float, select: Selector | None = None, views: Sequence[int] = ()
@@ -189,10 +99,6 @@ class AnchorScene(LatticeScene):
             activation=True,
             appearance=self.config.appearance,
         )
-
-    @property
-    def K(self) -> int:
-        return self.config.K
 
     @property
     def positions(self) -> Tensor:
@@ -324,37 +230,6 @@ class AnchorScene(LatticeScene):
         scene._modules = {**self._modules, "table": table}
         return scene
 
-    def decode(self, rows: Tensor, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Decoded:
-        """Decode the given anchors [A]. Uses the device's fused kernels if they support the scene,
-        otherwise PyTorch."""
-        weights = self.fused_weights(step)
-        if weights is None:
-            return self.decode_composed(rows, camera, step, mode)
-        if self.codes is not None:
-            weights["color"] = fold(weights["color"], self.codes(camera, mode))
-        with_dist = {a: a in self.config.add_dist for a in ATTRIBUTES}
-        xyz, columns, rounding = self.table.facts["xyz"], self.columns(), self.rounding
-        outside = self.route_outside(weights, rows, step, mode)
-        if rows.device.type == "cpu":
-            made = native_decode.decode(rows, xyz, *columns, camera.position, weights, with_dist, self.extent, outside, rounding)
-        else:
-            columns = columns if rounding is None else rounding.round(columns)
-            made = triton_decode.decode(rows, xyz, *columns, camera.position, weights, with_dist, self.extent, outside)
-        decoded = Decoded(made[0], rows, made[1], made[2])
-        return decoded if rounding is None else rounding.mark(decoded)
-
-    def columns(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return feature [N, F], log_scaling [N, 6] and offsets [N, K, 3] as they are learned."""
-        p = self.table.params
-        return p["feature"], p["log_scaling"], p["offsets"]
-
-    @property
-    def rounding(self) -> RowRounding | None:
-        """How values are rounded before they are drawn; None: they are drawn as they are."""
-        if self.steps is None or KEEP not in self.table.params:
-            return None
-        return RowRounding(self.steps.log_steps, self.table.facts[CLASS], self.table.params[KEEP], self.steps.scale)
-
     def start_rounding(self, steps: Tensor, classes: Tensor, scale: float = 1.0) -> None:
         """Draw values from now on as a compact file would hold them, with masks that are all open.
         steps: [F + 6 + 3 K]; classes: [N] int64; scale: of the world, `data.views.World`."""
@@ -375,116 +250,6 @@ class AnchorScene(LatticeScene):
         if rounding is None or self.steps is None:
             return self
         return self.with_table(settle(self.table, rounding, self.steps.by_column(self.config.F)))
-
-    def route_outside(
-        self, weights: dict[str, HeadWeights], rows: Tensor, step: int, mode: Mode = Mode.DRAW
-    ) -> dict[str, tuple[Routing, Tensor]]:
-        """Return the routing and the mixture weights of rows [A] by attribute, where the fused
-        decode has no code for the router."""
-        heads = {a: self.heads[a] for a, w in weights.items() if w.routed_outside}
-        if not heads:
-            return {}
-        feature, position = self.drawn(rows)[0], self.table.facts["xyz"].index_select(0, rows) / self.extent
-        return {a: head.route(feature, step, position, mode) for a, head in heads.items()}  # type: ignore[misc]
-
-    def fused_weights(self, step: int) -> dict[str, HeadWeights] | None:
-        """Return the heads' tensors for the fused decode (compiled on the CPU, Triton on CUDA), or
-        None if it does not apply.
-
-        Raises InputError with `decode = native` where it does not apply.
-        """
-        weights = {a: self.heads[a].weights(step) for a in ATTRIBUTES}
-        why = self.why_composed(weights)
-        if why and self.config.decode == "native":
-            raise InputError(f"expected a scene that the native decode covers, found {why}; use --scene.decode auto")
-        return None if why or self.config.decode == "composed" else weights
-
-    def why_composed(self, weights: dict[str, HeadWeights]) -> str:
-        """Return why plain PyTorch decodes, or "" where the fused decode supports the scene."""
-        feature = self.table.params["feature"]
-        if missing := no_kernels(feature.device):
-            return missing
-        if self.bank is not None:
-            return "a feature bank"
-        if feature.dtype != torch.float32:
-            return f"tensors of {feature.dtype}"
-        if not feature.is_cuda:
-            return ""
-        wide = [a for a, w in weights.items() if not covers(a, w, self.config.F, self.K)]
-        if len({w.w1.shape[1] for w in weights.values()}) > 1:
-            return "networks of several widths"
-        return f"networks of {wide[0]} that are too deep or too wide for the kernels" if wide else ""
-
-    def describe_decode(self, step: int) -> str:
-        """Say which decode runs at `step`, and why not the fused one, as
-        `Scene.describe_decode`."""
-        weights = {a: self.heads[a].weights(step) for a in ATTRIBUTES}
-        why = self.why_composed(weights) or ("--scene.decode composed" if self.config.decode == "composed" else "")
-        if why:
-            return f"composed, in plain torch ({why})"
-        outside = [a for a, w in weights.items() if w.routed_outside]
-        kernels = "compiled" if self.table.device.type == "cpu" else "Triton"
-        return f"fused ({kernels})" + (f", routed in torch ({', '.join(outside)}: a router without a kernel)" if outside else "")
-
-    def drawn(self, rows: Tensor) -> tuple[Tensor, ...]:
-        """Return `columns` of rows [A] as they are drawn."""
-        rounding = self.rounding
-        return tuple(c.index_select(0, rows) for c in self.columns()) if rounding is None else rounding.round(self.columns(), rows)
-
-    def inputs(self, rows: Tensor, camera: Camera, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return features [A, F] of `features` [N, F], unit directions from camera to anchor [A, 3] and distances [A,
-        1]."""
-        v = self.table.facts["xyz"].index_select(0, rows) - camera.position.to(self.table.facts["xyz"])
-        distance = v.norm(dim=1, keepdim=True)
-        return features.index_select(0, rows), v / distance.clamp_min(EPS), distance
-
-    def decode_composed(self, rows: Tensor, camera: Camera, step: int, mode: Mode = Mode.DRAW) -> Decoded:
-        """Reference decode in PyTorch: call one head per attribute, then mask, activate and place
-        the Gaussians."""
-        p, K, rounding, table = self.table.params, self.K, self.rounding, self.table
-        if rounding is not None:
-            p = dict(zip(ROUNDED, rounding.round(self.columns())))
-            table = cast(Table, SimpleNamespace(params=p, facts=table.facts))
-        feature, direction, distance = self.inputs(rows, camera, p["feature"])
-        seen = feature if self.bank is None else self.bank(table, rows, direction, distance)
-        position = self.table.facts["xyz"].index_select(0, rows) / self.extent
-        out: dict[str, Tensor] = {}
-        routing: dict[str, Routing] = {}
-        for attribute in ATTRIBUTES:
-            head = self.heads[attribute]
-            x = torch.cat([seen, direction] + ([distance] if attribute in self.config.add_dist else []), dim=1)
-            if attribute == "color" and self.codes is not None:
-                x = torch.cat([x, self.codes(camera, mode).expand(len(x), -1)], dim=1)
-            out[attribute], found = head(x, feature, step, position, mode)
-            if found is not None:
-                routing[attribute] = found
-        raw = out["opacity"]  # [A, K]
-        keep = (raw > 0).reshape(-1).nonzero().squeeze(1)  # only slots of strictly positive opacity are drawn
-        anchor = torch.div(keep, K, rounding_mode="floor")
-        row = rows.index_select(0, anchor)
-        scaling = p["log_scaling"].index_select(0, row).exp()
-        cov = out["cov"].reshape(-1, 7).index_select(0, keep)
-        source = row * K + (keep - anchor * K)
-        offset = p["offsets"].reshape(-1, 3).index_select(0, source)
-        gaussians = Gaussians(
-            means=self.table.facts["xyz"].index_select(0, row) + offset * scaling[:, :3],  # eq. 2
-            quats=functional.normalize(cov[:, 3:], dim=1, eps=EPS),
-            scales=scaling[:, 3:] * cov[:, :3].sigmoid(),
-            opacities=raw.reshape(-1).index_select(0, keep),
-            colors=out["color"].reshape(-1, 3).index_select(0, keep),
-            source=source,
-        )
-        decoded = Decoded(gaussians, rows, raw, routing)
-        return decoded if rounding is None else rounding.mark(decoded)
-
-    def routing(self, step: int, most: int | None = None, mode: Mode = Mode.DRAW) -> dict[str, Routing]:
-        """Return the routing by attribute for all anchors, or for at most `most` evenly spaced
-        ones. It is independent of the camera."""
-        every = max(1, -(-len(self.table) // most)) if most else 1
-        rows = torch.arange(0, len(self.table), every, device=self.table.device)
-        feature, position = self.drawn(rows)[0], self.table.facts["xyz"][::every] / self.extent
-        found = {a: self.heads[a].route(feature, step, position, mode) for a in ATTRIBUTES}
-        return {a: r[0] for a, r in found.items() if r is not None}
 
     def end_batch(self, views: int) -> None:
         for head in self.heads.values():
@@ -535,10 +300,3 @@ class AnchorScene(LatticeScene):
         parts = {attribute: head.tensors() for attribute, head in self.heads.items()}
         parts |= {name: dict(m.named_parameters()) for name, m in (("mix", self.bank), ("appearance", self.codes)) if m is not None}
         return {f"{part}.{name}": p for part, found in parts.items() for name, p in found.items()}
-
-
-def no_kernels(device: torch.device) -> str | None:
-    """Return None if `device` has fused kernels, otherwise the reason why it has none."""
-    if device.type == "cuda":
-        return triton.explain_missing()
-    return native.explain_missing() if device.type == "cpu" else f"no kernels for {device.type}"

@@ -1,7 +1,7 @@
 """Decode of an anchor scene on CUDA with Triton kernels: gather -> direction -> routing -> experts
 -> Gaussians.
 
-Forward and backward compute the same function as `AnchorScene.decode_composed`, the reference.
+Forward and backward compute the same function as `DecodingScene.decode_composed`, the reference.
 Anchors are sorted by their set of chosen experts. Top-k therefore evaluates k networks per anchor
 instead of E, and no tensor [A, k, outputs] is stored. The host waits for the device once, for the
 number of Gaussians. The backward pass recomputes the hidden layers. No sum uses atomics: on one

@@ -30,8 +30,8 @@ from scene_experts.geometry.neighbours import knn_d2
 from scene_experts.geometry.voxel import VoxelChoice, choose_voxel_size, coarsen, find_unique_cells, to_lattice
 from scene_experts.native import triton
 from scene_experts.scene import OPACITY, Cull, LatticeScene, LearningRates, SceneConfig, Traits
+from scene_experts.scene.anchors.decode import EPS
 from scene_experts.scene.anchors.mlp import CHANNELS
-from scene_experts.scene.anchors.scene import EPS
 from scene_experts.scene.anchors.select import visible_rows
 from scene_experts.scene.graph import fused
 from scene_experts.scene.graph.hash_grid import Grid, HashGrid

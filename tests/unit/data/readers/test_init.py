@@ -22,7 +22,8 @@ from scene_experts.data.settings import Data
 from scene_experts.render import choose
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Finished
-from scene_experts.training.loop import Job, train
+from scene_experts.training.job import Job
+from scene_experts.training.loop import train
 from scene_experts.training.recipes import RECIPES
 from support.captures import load
 from support.synthetic import make_capture

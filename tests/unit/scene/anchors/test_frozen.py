@@ -7,8 +7,8 @@ import torch
 
 from scene_experts.core.types import Camera, Mode, Points
 from scene_experts.native import library as native
+from scene_experts.scene.anchors import decode as anchors
 from scene_experts.scene.anchors import native_decode
-from scene_experts.scene.anchors import scene as anchors
 from scene_experts.scene.anchors.balance import Balanced
 from scene_experts.scene.anchors.experts import Experts
 from scene_experts.scene.anchors.features import FeatureBank

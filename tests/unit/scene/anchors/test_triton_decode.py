@@ -8,8 +8,8 @@ import torch
 from scene_experts.core.table import Table
 from scene_experts.core.types import Camera, Gaussians, Routing
 from scene_experts.native.triton import explain_missing
+from scene_experts.scene.anchors import decode as anchors
 from scene_experts.scene.anchors import native_decode, triton_decode, triton_networks
-from scene_experts.scene.anchors import scene as anchors
 from scene_experts.scene.anchors.experts import Experts
 from scene_experts.scene.anchors.mlp import NOT_ROUTED, Plain
 from scene_experts.scene.anchors.routers import Linear
