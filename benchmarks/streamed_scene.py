@@ -10,7 +10,6 @@ compact file of the same numbers.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from pathlib import Path
 
@@ -38,7 +37,7 @@ def psnr(a: Tensor, b: Tensor) -> float:
 
 def states(page: Path) -> list[tuple[int, AnchorData]]:
     """The bytes that are here, and the scene that is shown then."""
-    settings = json.loads(html.settings_in(page.read_bytes()))
+    settings = html.settings_in(page.read_bytes())
     first, plan, *chunks = [page.parent / settings["folder"] / name for name, *_ in settings["parts"]]
     with opening(first, budget.COMPACT) as source:
         base = compact.decode_whole(source.read(), source)

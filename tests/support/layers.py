@@ -11,7 +11,7 @@ from scene_experts.core.reading import budget
 from scene_experts.core.reading.source import opening
 from scene_experts.files.anchors import compact
 from scene_experts.files.anchors.data import AnchorData
-from scene_experts.files.anchors.layers import LayeredScene, Layers, encode
+from scene_experts.files.anchors.layers import EncodedLayers, LayeredScene, encode
 
 
 def make_coarse(data: AnchorData, share: float = 0.4, seed: int = 0) -> tuple[torch.Tensor, AnchorData]:
@@ -30,13 +30,13 @@ def make_coarse(data: AnchorData, share: float = 0.4, seed: int = 0) -> tuple[to
     return rows, replace(data, columns=columns, cells=data.cells[rows], precision=precision)
 
 
-def make_layers(data: AnchorData, share: float = 0.4) -> Layers:
+def make_layers(data: AnchorData, share: float = 0.4) -> EncodedLayers:
     """The layers of a scene whose last anchors are seen first."""
     rows, coarse = make_coarse(data, share)
     return encode(data, rows, coarse, torch.arange(len(data.columns["feature"])).float())
 
 
-def open_layers(folder: Path, layers: Layers, plan: bytes | None = None) -> LayeredScene:
+def open_layers(folder: Path, layers: EncodedLayers, plan: bytes | None = None) -> LayeredScene:
     """The scene of layers, of which no chunk is taken."""
     path = folder / "coarse.compact"
     path.write_bytes(layers.coarse)

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -28,6 +29,9 @@ WIDTH, HEIGHT = 320, 240
 SEEN = look((0.3, -0.4, -1.0), width=WIDTH, height=HEIGHT)
 BACKGROUND = (0.2, 0.3, 0.5)
 LINE = "(line => !line || line.hidden ? '' : line.firstChild.textContent)(document.getElementById('progress'))"
+
+COUNT_EMPTY = """window.empty = 0; // how often a renderer on WebGPU had no picture
+setInterval(() => { const { name, renderer } = sceneExperts.page.renderer; window.empty += name === "WebGPU" && !renderer.texture; }, 1);"""
 
 
 @contextmanager
@@ -58,7 +62,7 @@ def serving(folder):
         server.server_close()
 
 
-def write(folder, monkeypatch, case="octree-gs"):
+def write(folder, monkeypatch, case="octree-gs", name="index.html"):
     """A page of four chunks or more. Returns the whole scene and the coarse one, as `picture` draws them."""
     monkeypatch.setattr(layers, "ANCHORS", 40)
     (folder / "favicon.ico").touch()  # browsers ask servers for it
@@ -67,8 +71,8 @@ def write(folder, monkeypatch, case="octree-gs"):
     data = replace(data, precision=from_spread(data.columns, data.networks))
     rows, coarse = make_coarse(data)
     note = {"cameras": [SEEN.pose, look((2.5, 0.5, 0.0)).pose], "nearest": 0.01 / 2.5, "background": BACKGROUND}
-    streamed.write(folder / "index.html", Layered(data, rows, coarse, torch.ones(len(data.columns["xyz"]))), note)
-    return scene_of(run, streamed.read(folder / "index.html"), WORLD)[0], scene_of(run, rounded(coarse, coarse.precision), WORLD)[0]
+    streamed.write(folder / name, Layered(data, rows, coarse, torch.ones(len(data.columns["xyz"]))), note)
+    return scene_of(run, streamed.read(folder / name), WORLD)[0], scene_of(run, rounded(coarse, coarse.precision), WORLD)[0]
 
 
 def picture(scene):
@@ -83,9 +87,9 @@ def psnr(a, b):
     return -10 * np.log10(((a - b) ** 2).mean() + 1e-12)
 
 
-def go(page, address):
+def go(page, address, name="index.html"):
     page.tab.set_default_timeout(300_000)
-    page.tab.goto(f"{address}/index.html")
+    page.tab.goto(f"{address}/{quote(name)}")
     page.tab.wait_for_function("window.sceneExperts?.page.renderer || /^The scene/.test(document.getElementById('note').textContent)")
 
 
@@ -101,6 +105,7 @@ def test_the_coarse_scene_is_shown_while_the_rest_is_late(tmp_path, monkeypatch,
         held.update({"plan", "02"})
         page = make()
         go(page, address)
+        page.tab.evaluate(COUNT_EMPTY)
         rest(page)
         assert page.said == "" and "%" in page.tab.evaluate(LINE) and page.renderer == ("WebGPU" if flags is GPU else "WebGL 2")
         shown = page.picture(BACKGROUND)
@@ -118,7 +123,7 @@ def test_the_coarse_scene_is_shown_while_the_rest_is_late(tmp_path, monkeypatch,
         page.settle()
         assert psnr(page.picture(BACKGROUND), picture(whole)) > 45 and page.tab.evaluate(LINE) == "" and page.errors == []
         assert all(request.startswith((address, "blob:")) for request in page.requests)
-        assert page.tab.evaluate("sceneExperts.page.parts + 2 === sceneExperts.page.settings.parts.length")
+        assert page.tab.evaluate("sceneExperts.page.parts + 2 === sceneExperts.page.settings.parts.length && empty === 0")
 
 
 def test_a_missing_or_damaged_part_is_a_sentence_and_what_is_here_stays(tmp_path, monkeypatch):
@@ -147,6 +152,15 @@ def test_a_missing_or_damaged_part_is_a_sentence_and_what_is_here_stays(tmp_path
             rest(page)
             assert psnr(page.picture(BACKGROUND), picture(whole)) > 45
             page.tab.close()
+
+
+def test_a_page_of_any_name_finds_its_parts(tmp_path, monkeypatch):
+    write(tmp_path, monkeypatch, "scaffold-gs", "a scene #1, 50 %?.html")
+    with serving(tmp_path) as (address, _), browsers(GL, WIDTH, HEIGHT) as make:
+        page = make()
+        go(page, address, "a scene #1, 50 %?.html")
+        page.settle()
+        assert page.said == page.tab.evaluate(LINE) == "" and page.errors == []
 
 
 def test_without_its_coarse_scene_or_from_disk_the_page_says_why(tmp_path, monkeypatch):

@@ -50,12 +50,12 @@ class OnGpu {
     if (fresh) this.at = view.position;
     return this.renderer.render(view, fresh);
   }
-  // Draws from now on what the worker has now.
-  async refresh(ask) {
+  // Draws what the worker has now, at once and from now on: a renderer without a picture would show an empty canvas. view(): what to draw.
+  async refresh(ask, view) {
     const scene = await ask("pack", { exact: this.settings.exact === true }), before = this.renderer, buffers = before.gpu.release();
     this.renderer = new GpuRenderer(before.gpu, scene, this.settings, before.canvas);
     this.at = null;
-    await before.gpu.device.queue.onSubmittedWorkDone();
+    await this.draw(view(), false);
     buffers.forEach((buffer) => buffer.destroy());
     before.texture?.destroy();
   }
@@ -85,7 +85,7 @@ class OnGl {
   get isFinal() {
     return !this.busy && this.isCurrent;
   }
-  // As OnGpu.refresh. view(): what to decode for.
+  // As OnGpu.refresh.
   async refresh(ask, view) {
     while (this.busy) await new Promise((done) => setTimeout(done, 20));
     this.busy = true;

@@ -7,6 +7,8 @@ import { sceneOf } from "./worker.js";
 
 const STALL = 30_000; // milliseconds without a byte until a part counts as missing
 const TRIES = 3, PAUSE = 1000; // of a part; milliseconds between them
+const WAIT = 50; // milliseconds between looks for a renderer
+const pause = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
 
 // In the worker: bytes become scenes.
 const acts = (use) => {
@@ -78,9 +80,9 @@ async function load(page) {
   const percent = () => `${Math.floor((100 * here) / total)} % of ${(total / 1e6).toFixed(1)} MB`;
   const came = (count) => ((here += count), tell ? tell(`loading: ${percent()}`) : say(`loading the scene: ${percent()}`));
   const fetchPart = async ([name, size, sum]) => {
-    for (let left = TRIES; ; await new Promise((done) => setTimeout(done, PAUSE)))
+    for (let left = TRIES; ; await pause(PAUSE))
       try {
-        return await get(`${folder}/${name}`, size, sum, came);
+        return await get(`${encodeURIComponent(folder)}/${name}`, size, sum, came);
       } catch (error) {
         if (--left <= 0) throw error;
       }
@@ -105,7 +107,8 @@ async function load(page) {
         i += 1;
         taken += 1;
         await ask("show");
-        await page.renderer?.refresh(ask, () => page.view());
+        while (!page.renderer) await pause(WAIT); // another one opens, with what the worker had before
+        await page.renderer.refresh(ask, () => page.view());
         page.wake();
         page.parts = taken;
       }

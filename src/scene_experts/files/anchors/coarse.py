@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -100,8 +101,8 @@ def make_layers(run: OpenRun, data: AnchorData, world: World, capture: Capture, 
 
     data: with its precision. world: of the data. capture: with the cameras of the run.
     """
-    whole, step = scene_of(run, rounded(data, _precision(data)), world)
-    assert isinstance(whole, AnchorScene)
+    scene, step = scene_of(run, rounded(data, _precision(data)), world)
+    whole = cast(AnchorScene, scene)
     pictures = _make_pictures(Painter.of(whole, step, rasterize, run.config.train.antialias), capture)
     N, K = len(whole.table), whole.K
     given = pictures.given(pictures.first or pictures.views, N * K).view(N, K).sum(1)

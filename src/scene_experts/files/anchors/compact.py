@@ -185,7 +185,7 @@ def read(path: Path) -> AnchorData:
 
 
 @dataclass(frozen=True)
-class Decoded:
+class CompactScene:
     """What a file holds, in coding order."""
 
     header: dict[str, Any]
@@ -222,7 +222,7 @@ def decode(data: bytes, source: Source) -> AnchorData:
     return decode_whole(data, source).restored()
 
 
-def decode_whole(data: bytes, source: Source) -> Decoded:
+def decode_whole(data: bytes, source: Source) -> CompactScene:
     """The whole numbers in the bytes of a file. Raises as `decode`."""
     header, parts = container.part(data)
     if header["version"] != VERSION:
@@ -254,7 +254,7 @@ def decode_whole(data: bytes, source: Source) -> Decoded:
     whole = WholeScene(values, steps_of(header["steps"], F, K, extra), extra, *_networks(parts, shapes, count))
     if checksum(places, whole) != header["integers"]:
         raise Damaged("numbers with another checksum")
-    return Decoded(header, places, origin, whole, shapes)  # type: ignore[arg-type]
+    return CompactScene(header, places, origin, whole, shapes)  # type: ignore[arg-type]
 
 
 def _shapes(listed: Any) -> dict[str, tuple[int, ...]]:

@@ -23,7 +23,7 @@ from scene_experts.core.reading.budget import CutShort, Damaged
 from scene_experts.core.reading.numbers import whole_number
 from scene_experts.core.reading.source import Source
 from scene_experts.files.anchors import compact
-from scene_experts.files.anchors.compact import BYTES_PER_VALUE, MODELS, MOST_ANCHORS, POSITIONS, Decoded, steps_of
+from scene_experts.files.anchors.compact import BYTES_PER_VALUE, MODELS, MOST_ANCHORS, POSITIONS, CompactScene, steps_of
 from scene_experts.files.anchors.data import AnchorData
 from scene_experts.files.anchors.places import MOST_LATTICES, AnchorPlaces, Lattice, find_places, from_zero, read_places, write_places
 from scene_experts.files.anchors.rounding import WholeScene, round_scene
@@ -41,7 +41,7 @@ _SUM = 4  # bytes of a chunk's checksum
 
 
 @dataclass(frozen=True)
-class Layers:
+class EncodedLayers:
     """The bytes of a scene in layers."""
 
     coarse: bytes
@@ -56,7 +56,7 @@ class Layers:
         return len(self.coarse) + len(self.plan) + sum(map(len, self.chunks))
 
 
-def encode(data: AnchorData, rows: Tensor, coarse: AnchorData, given: Tensor) -> Layers:
+def encode(data: AnchorData, rows: Tensor, coarse: AnchorData, given: Tensor) -> EncodedLayers:
     """The layers of a scene of N anchors.
 
     rows: [n], of the anchors of the coarse scene. coarse: the scene of these anchors, of the same
@@ -101,13 +101,13 @@ def encode(data: AnchorData, rows: Tensor, coarse: AnchorData, given: Tensor) ->
     }
     plan = container.join(header, {POSITIONS: positions.pack(), MODELS: numbers.pack()}, MARK)
     coarse_file = compact.encode_arranged(coarse, base)[0]
-    return Layers(coarse_file, plan, [stream + zlib.crc32(stream).to_bytes(_SUM, "little") for stream in streams])
+    return EncodedLayers(coarse_file, plan, [stream + zlib.crc32(stream).to_bytes(_SUM, "little") for stream in streams])
 
 
 class LayeredScene:
     """The scene of layers that arrive one after the other."""
 
-    def __init__(self, base: Decoded, plan: bytes, source: Source) -> None:
+    def __init__(self, base: CompactScene, plan: bytes, source: Source) -> None:
         """base: the coarse scene; plan: the bytes that belong to it. Raises CutShort and Damaged for
         a plan that is damaged or belongs to another scene."""
         header, parts = container.part(plan, MARK)

@@ -7,7 +7,6 @@ them. The page knows the length and the checksum of each, and their names change
 
 from __future__ import annotations
 
-import json
 import re
 import zlib
 from pathlib import Path
@@ -17,7 +16,7 @@ from scene_experts.core.io import write_bytes
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.budget import CutShort, Damaged
 from scene_experts.core.reading.numbers import whole_number
-from scene_experts.core.reading.source import opening
+from scene_experts.core.reading.source import inside, opening
 from scene_experts.data.views import Capture, World
 from scene_experts.files.anchors import compact, layers, live
 from scene_experts.files.anchors.coarse import Layered, make_layers
@@ -65,12 +64,12 @@ def read(path: Path) -> AnchorData:
     """The scene of a page and its parts. Raises InputError for other and damaged pages, and for
     parts that are missing or damaged."""
     with opening(path, budget.HTML) as source:
-        settings = json.loads(html.settings_in(source.read()))
+        settings = html.settings_in(source.read())
         listed = [(str(name), whole_number(size, "the length of a part", 0, _MOST_PART)) for name, size, _ in settings["parts"]]
-        folder = str(settings["folder"])
-        if len(listed) < 3 or not all(_NAME.fullmatch(name) for name, _ in listed) or Path(folder).name != folder:
+        if len(listed) < 3 or not all(_NAME.fullmatch(name) for name, _ in listed):
             raise Damaged("no list of parts")
-    first, plan, *chunks = [Path(path).parent / folder / name for name, _ in listed]
+        folder = inside(Path(path).parent, settings["folder"])
+    first, plan, *chunks = [folder / name for name, _ in listed]
     with opening(first, budget.COMPACT) as source:
         base = compact.decode_whole(source.read(), source)
     with opening(plan, budget.COMPACT) as source:

@@ -106,12 +106,12 @@ def scene_in(page: bytes) -> bytes:
         raise Damaged("a scene that is not base64") from None
 
 
-def settings_in(page: bytes) -> bytes:
-    """The text of the settings in a page. Raises CutShort for a page without them."""
-    content = _script(page, _SETTINGS)
-    if content is None:
+def settings_in(page: bytes) -> dict[str, Any]:
+    """The settings in a page. Raises CutShort for a page without them, ValueError for damaged ones."""
+    found = _settings(page)
+    if not found:
         raise CutShort("no settings")
-    return content
+    return found
 
 
 def unit_of(splats: Splats) -> float:
