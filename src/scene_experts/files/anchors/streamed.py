@@ -34,7 +34,7 @@ GENERATOR = "scene-experts streamed"
 MARK = f'<meta name="generator" content="{GENERATOR}">'.encode()
 CODE = "streamed.min.js.gz"
 FOLDER = ".parts"  # behind the name of the page without its suffix
-MORE = 1.06  # times the bytes of a compact file, at most about
+MORE = 1.075  # times the bytes of a compact file, at most about
 _NAME = re.compile(r"(coarse|plan|\d{2})-[0-9a-f]{8}\.bin")
 _MOST_PART = 1 << 40  # bytes
 
