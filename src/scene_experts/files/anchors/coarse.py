@@ -24,6 +24,7 @@ from scene_experts.files.anchors.data import AnchorData
 from scene_experts.files.anchors.precision import Precision
 from scene_experts.files.anchors.read import scene as scene_of
 from scene_experts.files.anchors.rounding import rounded
+from scene_experts.files.bake.views import Views
 from scene_experts.files.measure import Painter, Tell
 from scene_experts.render import Rasterizer
 from scene_experts.scene.anchors.quantise import KEEP, ROUNDED
@@ -40,6 +41,7 @@ SHIFTS = {"feature": 5, "log_scaling": 4, "offsets": 4}
 """Binary logarithms of the steps, in those of the whole scene."""
 ITERATIONS = 500
 VIEWS, SIDE = 64, 360  # training views that it is fitted to; px of their shorter side, at most
+FREE_VIEWS = 32  # views between training views, whose pictures the whole scene has too
 FIRST = 4  # every so many iterations see a first view
 WEIGHT, LOOK, MOST_CHANGE = 0.006, 50, 2.0  # of the bits at first; iterations after which it follows the size, by this factor at most
 BEGIN = 1.15  # times the size, at which the fit begins
@@ -125,8 +127,10 @@ def _precision(data: AnchorData) -> Precision:
 def _make_pictures(painter: Painter, capture: Capture) -> _Pictures:
     black = torch.zeros(3)
     first = find_first_views(capture, lambda camera: painter.rasterize(painter.gaussians(camera), camera, black))
-    views = [_limit(capture.views[i].camera) for i in evenly(capture.train, VIEWS)]
-    return _Pictures(painter, torch.tensor(capture.background), views, [_limit(view.camera) for view in first], {})
+    every, generator = Views.of(capture), torch.Generator().manual_seed(0)
+    views = [capture.views[i].camera for i in evenly(capture.train, VIEWS)] + [every.free(generator) for _ in range(FREE_VIEWS)]
+    limited = [[_limit(camera) for camera in cameras] for cameras in (views, [view.camera for view in first])]
+    return _Pictures(painter, torch.tensor(capture.background), *limited, {})
 
 
 def _limit(camera: Camera) -> Camera:
