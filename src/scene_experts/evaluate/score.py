@@ -13,7 +13,7 @@ OUT/test_half and results_half.json for appearance codes that are fitted to half
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -97,36 +97,27 @@ def evaluate(
         drawing = Drawing(scene.frozen(step), rasterize, step, background, options.appearance == "half", scene.as_photographed)
         aligns = options.views == "test" and (options.align_poses or scene.poses is not None)
 
-        def score_mine() -> dict[int, dict[str, Any]]:
-            found = {}
-            for n in mine:
-                index = chosen[n]
-                capture.images.prefetch([chosen[later] for later in mine if later > n][:2])
-                name = capture.views[index].name
-                if aligns:
-                    cameras[n] = drawing.align(capture, index, cameras[n], scene.extent)
-                shown, facts = drawing.draw(capture, index, cameras[n])
-                scores = shown.score(perceptual, device)
-                writer.submit(partial(shown.write, folder, files[name], scores))
-                found[n] = {"file": files[name], **scores, **facts}
-                tell("rendering and scoring", n + 1, len(chosen))
-            return found
+        def score_view(n: int) -> dict[str, Any]:
+            index, file = chosen[n], files[capture.views[chosen[n]].name]
+            capture.images.prefetch([chosen[later] for later in mine if later > n][:2])
+            if aligns:
+                cameras[n] = drawing.align(capture, index, cameras[n], scene.extent)
+            shown, facts = drawing.draw(capture, index, cameras[n])
+            scores = shown.score(perceptual, device)
+            writer.submit(partial(shown.write, folder, file, scores))
+            tell("rendering and scoring", n + 1, len(chosen))
+            return {"file": file, **scores, **facts}
 
-        parts = group.gather_values((group.agree(score_mine), perceptual.absent))
+        parts = group.gather_values((group.agree(lambda: {n: score_view(n) for n in mine}), perceptual.absent))
         if not group.first:
             return {}
-        by_place: dict[int, dict[str, Any]] = {}
-        for values, absent in parts:
-            by_place |= values
-            perceptual.absent.update(absent)  # a score that one process lacks is not the mean of the others' views
-        per_view = {capture.views[index].name: by_place[n] for n, index in enumerate(chosen)}
+        per_view = collect(parts, [capture.views[index].name for index in chosen], perceptual)
         write_expert_strips(folder, scene, cameras[0], step, rasterize, background)
         found = {
             "format": FORMAT,
             **results.describe_scores(per_view, perceptual),
             **results.describe_scene(scene, step),
-            "gaussians_rendered": results.mean_over_views(per_view, "gaussians_rendered"),
-            "activation_ratio": results.mean_over_views(per_view, "activation_ratio"),
+            **{name: results.mean_over_views(per_view, name) for name in ("gaussians_rendered", "activation_ratio")},
             "fps": asdict(measure_speed(scene, cameras, step, rasterize, background)),
             **results.describe_views(capture, cameras, options, aligns),
             **results.describe_run(about or About(), step, rasterize, perceptual),
@@ -135,6 +126,17 @@ def evaluate(
         write_json(out / f"per_view{options.suffix}.json", per_view)
         write_json(out / f"results{options.suffix}.json", found)
         return found
+
+
+def collect(
+    parts: Iterable[tuple[dict[int, dict[str, Any]], dict[str, str]]], names: Sequence[str], perceptual: Perceptual
+) -> dict[str, Any]:
+    """Return the scores by view of all processes. names: of the scored views, in order."""
+    by_place: dict[int, dict[str, Any]] = {}
+    for values, absent in parts:
+        by_place |= values
+        perceptual.absent.update(absent)  # a score that one process lacks is not the mean of the others' views
+    return {name: by_place[n] for n, name in enumerate(names)}
 
 
 def choose_views(capture: Capture, options: EvalOptions) -> tuple[int, ...]:

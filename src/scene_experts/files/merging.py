@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from scene_experts.files.scene_folder import write_result_folder
 from scene_experts.scene import Scene
 from scene_experts.scene.anchors.quantise import CLASS
 from scene_experts.training import run_folder
+from scene_experts.training.config import RunConfig
 from scene_experts.training.run_folder import OpenRun
 
 log: logging.Logger = logging.getLogger(__name__)
@@ -42,51 +43,14 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
     fingerprint, blocks = read_plan(plan)
     if len(runs) != len(blocks):
         raise InputError(f"expected {len(blocks)} runs, one for each block of {plan}, found {len(runs)}; name them in the plan's order")
-    columns: dict[str, list[Tensor]] = {}
-    networks: dict[str, Tensor] = {}
-    lattice: dict[str, Any] = {}
-    masks: list[Tensor] = []
-    masked = False
-    configs, step, seconds, poses = [], 0, 0.0, ""
+    parts = _Parts(fingerprint)
     for number, path in enumerate(runs):  # one run in memory at a time
-        run = run_folder.open_run(path)
-        scene = run.scene
-        if not scene.traits.voxel:
-            raise InputError(f"expected a scene of anchors in {path}, found one of {scene.traits.rows}; train an anchor recipe")
-        if run.capture != fingerprint:
-            raise InputError(f"expected a run on the capture of the plan, found one on another in {path}; use the plan's command")
-        if scene.poses is not None:
-            raise InputError(f"expected blocks on the poses of the capture, found refined ones in {path}; train it without --refine-poses")
-        if not same_poses(poses, run.poses):
-            raise InputError(f"expected runs on one capture, found other camera poses in {path} than in {runs[0]}; train it again")
-        poses = poses or run.poses
-        _check_box(blocks, number, run)
-        if not configs:
-            networks, lattice = {name: value.detach().clone() for name, value in scene.network_tensors().items()}, _lattice(scene)
-        _check_same(lattice, networks, scene, path)
-        rows = blocks[number].holds(scene.positions.detach())
-        masks.append(scene.table.facts.get("slots", torch.ones(len(scene.table), scene.K, dtype=torch.bool))[rows])
-        masked |= "slots" in scene.table.facts
-        for name, column in scene.table.columns().items():
-            if name in ("slots", CLASS):
-                continue
-            kind = "params" if name in scene.table.params else "facts"
-            columns.setdefault(f"{kind}.{name}", []).append(column.detach()[rows])
-        configs.append(run.config)
-        step, seconds = max(step, run.step), seconds + run.clock.seconds
-        del run, scene
-    tensors = {f"network.{name}": value for name, value in networks.items()}
-    for name in list(columns):
-        tensors[name] = torch.cat(columns.pop(name))
-    if masked:
-        tensors["facts.slots"] = torch.cat(masks)
-    data = replace(configs[0].data, views=None)
+        parts.add(run_folder.open_run(path), path, blocks, number)
+    data = replace(parts.configs[0].data, views=None)
     command = f"merged from {len(runs)} blocks"
-    config = replace(configs[0], data=data, command=command, versions=run_folder.versions(), stop_at=None, init_from=None)
+    config = replace(parts.configs[0], data=data, command=command, versions=run_folder.versions(), stop_at=None, init_from=None)
     run_folder.prepare(out, config, resume=False)
-    meta = {"recipe": config.train.recipe, "step": step, "seconds": seconds, "capture": fingerprint, "poses": poses}
-    checkpoint.save(out / "checkpoints", step, tensors, {**lattice, **meta, "config": "imported"})
-    del tensors
+    parts.save(out)
     merged = run_folder.open_run(out)
     capture = run_folder.capture_of(merged)
     try:
@@ -94,6 +58,65 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
     finally:
         capture.images.close()
     return len(merged.scene.table)
+
+
+@dataclass
+class _Parts:
+    """What the merged run takes from the runs of the blocks that were added."""
+
+    fingerprint: str  # of the capture
+    configs: list[RunConfig] = field(default_factory=list)
+    columns: dict[str, list[Tensor]] = field(default_factory=dict)  # rows by block
+    slots: list[Tensor] = field(default_factory=list)  # rows by block
+    has_slots: bool = False
+    networks: dict[str, Tensor] = field(default_factory=dict)  # those of the first block, and of each
+    lattice: dict[str, Any] = field(default_factory=dict)  # the same
+    poses: str = ""
+    step: int = 0
+    seconds: float = 0.0
+
+    def add(self, run: OpenRun, path: Path, blocks: Sequence[Block], number: int) -> None:
+        """Add the anchors inside the own box of block `number`. Raises InputError as `merge_blocks`."""
+        scene = run.scene
+        self._check(run, path)
+        _check_box(blocks, number, run)
+        if not self.configs:
+            self.networks = {name: value.detach().clone() for name, value in scene.network_tensors().items()}
+            self.lattice = _lattice(scene)
+        _check_same(self.lattice, self.networks, scene, path)
+        rows = blocks[number].holds(scene.positions.detach())
+        self.slots.append(scene.table.facts.get("slots", torch.ones(len(scene.table), scene.K, dtype=torch.bool))[rows])
+        self.has_slots |= "slots" in scene.table.facts
+        for name, column in scene.table.columns().items():
+            if name in ("slots", CLASS):
+                continue
+            kind = "params" if name in scene.table.params else "facts"
+            self.columns.setdefault(f"{kind}.{name}", []).append(column.detach()[rows])
+        self.configs.append(run.config)
+        self.poses = self.poses or run.poses
+        self.step, self.seconds = max(self.step, run.step), self.seconds + run.clock.seconds
+
+    def _check(self, run: OpenRun, path: Path) -> None:
+        scene = run.scene
+        if not scene.traits.voxel:
+            raise InputError(f"expected a scene of anchors in {path}, found one of {scene.traits.rows}; train an anchor recipe")
+        if run.capture != self.fingerprint:
+            raise InputError(f"expected a run on the capture of the plan, found one on another in {path}; use the plan's command")
+        if scene.poses is not None:
+            raise InputError(f"expected blocks on the poses of the capture, found refined ones in {path}; train it without --refine-poses")
+        if not same_poses(self.poses, run.poses):
+            raise InputError(f"expected runs on one capture, found other camera poses in {path} than in the first block; train it again")
+
+    def save(self, out: Path) -> None:
+        """Write the checkpoint of the merged run, and let go of the parts."""
+        tensors = {f"network.{name}": value for name, value in self.networks.items()}
+        for name in list(self.columns):
+            tensors[name] = torch.cat(self.columns.pop(name))
+        if self.has_slots:
+            tensors["facts.slots"] = torch.cat(self.slots)
+        config = self.configs[0]
+        meta = {"recipe": config.train.recipe, "step": self.step, "seconds": self.seconds, "capture": self.fingerprint, "poses": self.poses}
+        checkpoint.save(out / "checkpoints", self.step, tensors, {**self.lattice, **meta, "config": "imported"})
 
 
 def _check_box(blocks: Sequence[Block], number: int, run: OpenRun) -> None:

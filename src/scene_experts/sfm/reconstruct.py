@@ -8,11 +8,7 @@ import importlib.util
 import json
 import os
 import shutil
-import subprocess
-import sys
 import time
-from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -26,7 +22,8 @@ from scene_experts.data.equirectangular import find_place
 from scene_experts.data.match import EXTENSIONS
 from scene_experts.data.readers import is_capture
 from scene_experts.native import library as native
-from scene_experts.sfm import frames, photos, work, worker
+from scene_experts.sfm import frames, photos, work
+from scene_experts.sfm.colmap import Say, run_worker
 from scene_experts.sfm.drift import KEY, NOTE, measure_drift
 from scene_experts.sfm.learned import attempt
 from scene_experts.sfm.learned.photographs import Shots
@@ -39,8 +36,6 @@ from scene_experts.sfm.photos import Photo
 LOG, VIDEO, FRAMES = "colmap.log", "video.txt", "frames"
 TEST = "test.txt"  # lists the views that a training holds out
 LEARNED = "database/learned"  # features and matches of networks, removed with the database
-
-Say = Callable[[str], None]
 
 
 def reconstruct(
@@ -72,36 +67,25 @@ def reconstruct(
         check_request(source, out, overwrite)  # again: results of a killed process may just have been published
         own = source.resolve() == (out / "images").resolve()
         images = out / "images" if own else folder / work.DONE / "images"
+        place = source
         if source.is_file():
-            say(f"reading {source.name}: the sharpest of its frames are used")
-            place = folder / FRAMES if (folder / FRAMES).is_dir() else images
-            found = extract_photos(source, place, options, progress)
-            if place == images and cuts(found, options):  # the frames are not the photographs of the capture
-                os.replace(images, folder / FRAMES)
-                os.replace(images.with_name(VIDEO), folder / VIDEO)
-                place = folder / FRAMES
+            found, place = take_frames(source, folder, images, options, say, progress)
         else:
-            place = source
             (folder / work.DONE / VIDEO).unlink(missing_ok=True)  # the images are no longer its frames
         found, rig = take_photos(found, place, images, options, say)
-        groups = photos.group_by_camera(found)
         names = [photo.name for photo in found]
-        pairs = choose_pairs(len(names), options.matching)
-        if pairs is not None and rig is not None:
-            pairs = [(i, j) for i, j in pairs if find_place(names[i]) != find_place(names[j])]
+        pairs = pairs_by_number(names, rig, options)
+        groups = photos.group_by_camera(found)
         kind = "frames" if source.is_file() else "photographs"
         said = f"{len(found)} {kind}, {len(groups)} camera{'s' if len(groups) > 1 else ''}"
-        every = len(names) * (len(names) - 1) // 2
         say(f"{said}, {len(pairs):,} pairs to match" if pairs is not None else said)
         masks = write_masks(found, images, folder / "masks")
         prepare_folder(folder, found, options, masks)
         request = describe_request(folder, images, groups, rig, bool(masks), pairs, names, options)
         began = time.monotonic()
         spare: list[tuple[int, int]] = []
-        if pairs is None:  # the features decide
-            run_worker({**request, "poses": False}, folder / LOG, say, progress)
-            pairs, spare = find_alike(Path(request["database"]), names, [find_place(name) for name in names])
-            say(f"{len(pairs):,} of {every:,} pairs to match: photographs that look alike, and each with those that follow it")
+        if pairs is None:
+            pairs, spare = pairs_by_features(request, names, folder, say, progress)
             asked = {"pairs": pairs, "spare": spare}
             request = {**request, **{name: [(names[i], names[j]) for i, j in some] for name, some in asked.items()}}
         shots = Shots(names, images, folder / "masks" if masks else None, folder / LEARNED, options.max_side, request["threads"])
@@ -113,15 +97,61 @@ def reconstruct(
             )
         if warning := warn_of_mapper(result, options):
             say(warning)
-        note = describe_result(result, found, options, time.monotonic() - began, copied=not own, exhaustive=len(pairs) == every)
-        if rig is not None:
-            write_bytes(Path(request["model"]) / TEST, "\n".join(choose_held_out(result["registered"])).encode())
-        drift = measure_drift(Path(request["model"]), images)
-        note |= {KEY: None if drift is None else round(drift, 3)}
-        write_json(folder / work.DONE / NOTE, note)
+        exhaustive = len(pairs) == every_pair(names)
+        note = describe_result(result, found, options, time.monotonic() - began, copied=not own, exhaustive=exhaustive)
+        write_facts(Path(request["model"]), images, rig, result, note, folder / work.DONE / NOTE)
         work.publish(out)
     shutil.rmtree(out / work.NAME, ignore_errors=True)
     return note
+
+
+def write_facts(model: Path, images: Path, rig: PanoramaRig | None, result: dict[str, Any], note: dict[str, Any], place: Path) -> None:
+    """Write what a training reads beside the model: which panoramas are held out, and the note, with
+    how much the exposures differ."""
+    if rig is not None:
+        write_bytes(model / TEST, "\n".join(choose_held_out(result["registered"])).encode())
+    drift = measure_drift(model, images)
+    note[KEY] = None if drift is None else round(drift, 3)
+    write_json(place, note)
+
+
+def take_frames(video: Path, folder: Path, images: Path, options: SfmOptions, say: Say, progress: Progress) -> tuple[list[Photo], Path]:
+    """Return the frames of a video, and the folder that they are in: `images`, unless views are cut
+    out of them."""
+    say(f"reading {video.name}: the sharpest of its frames are used")
+    place = folder / FRAMES if (folder / FRAMES).is_dir() else images
+    found = extract_photos(video, place, options, progress)
+    if place == images and cuts(found, options):  # the frames are not the photographs of the capture
+        os.replace(images, folder / FRAMES)
+        os.replace(images.with_name(VIDEO), folder / VIDEO)
+        place = folder / FRAMES
+    return found, place
+
+
+def pairs_by_number(names: list[str], rig: PanoramaRig | None, options: SfmOptions) -> list[tuple[int, int]] | None:
+    """Return the pairs to match, as places in `names`; None: the features decide. Views of one
+    panorama are not matched with each other."""
+    pairs = choose_pairs(len(names), options.matching)
+    if pairs is None or rig is None:
+        return pairs
+    return [(i, j) for i, j in pairs if find_place(names[i]) != find_place(names[j])]
+
+
+def pairs_by_features(
+    request: dict[str, Any], names: list[str], folder: Path, say: Say, progress: Progress
+) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+    """Find the features, and return the pairs that look alike and those to spare, as places in
+    `names`."""
+    run_worker({**request, "poses": False}, folder / LOG, say, progress)
+    pairs, spare = find_alike(Path(request["database"]), names, [find_place(name) for name in names])
+    every = every_pair(names)
+    say(f"{len(pairs):,} of {every:,} pairs to match: photographs that look alike, and each with those that follow it")
+    return pairs, spare
+
+
+def every_pair(names: list[str]) -> int:
+    """Return the number of pairs of photographs."""
+    return len(names) * (len(names) - 1) // 2
 
 
 def describe_request(
@@ -260,71 +290,6 @@ def prepare_folder(folder: Path, found: list[Photo], options: SfmOptions, masks:
         note.write_text(mark)
     for left in (folder / "maps", folder / work.DONE / "model"):
         work.remove(left)
-
-
-def run_worker(request: dict[str, Any], log: Path, say: Say, progress: Progress) -> dict[str, Any]:
-    """Run COLMAP in a process of its own (`worker.py`) and return its last message.
-
-    Raises InputError if pycolmap cannot be used, RunError if the worker fails.
-    """
-    environment = {**os.environ, "OMP_NUM_THREADS": str(request["threads"])}
-    with log.open("w") as stream:
-        # -P: modules are not searched in the worker's folder. In a new session, because this
-        # process handles Ctrl-C.
-        process = subprocess.Popen(
-            [sys.executable, "-P", worker.__file__],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stream, text=True, env=environment, start_new_session=True,
-        )  # fmt: skip
-        assert process.stdin is not None and process.stdout is not None
-        last: dict[str, Any] = {}
-        try:
-            with suppress(BrokenPipeError):  # a worker that died at once: its exit code says so
-                process.stdin.write(json.dumps(request) + "\n")
-                process.stdin.flush()  # it stays open: the worker ends when this process does, however it ends
-            for line in process.stdout:
-                last = json.loads(line)
-                if "total" in last:
-                    progress(last["step"], last["done"], last["total"])
-                elif last["step"] == "failed":
-                    say(f"the {last['mapper']} mapper failed: {last['why']}")
-                elif last["step"] == "next mapper":
-                    apart = f" in the largest of {last['parts']} parts, which do not fit together" if last["parts"] > 1 else ""
-                    posed = f"gave {last['posed']} of {last['photographs']} photographs a pose{apart}"
-                    say(f"the {last['mapper']} mapper {posed}; the global mapper runs too, and the better result is kept")
-                elif last["step"] == "weak":
-                    say(f"{last['photographs']} photographs fit too few others; {last['pairs']:,} more pairs are matched for them")
-                elif last["step"] == "unread":
-                    say(f"warning: COLMAP cannot read {', '.join(last['names'])}")
-            code = process.wait()
-        finally:
-            if process.poll() is None:
-                process.kill()
-                process.wait()
-            with suppress(BrokenPipeError):
-                process.stdin.close()
-    if last.get("step") == "missing":
-        raise InputError(f"pycolmap cannot be imported ({last['why']}): {install_line('sfm')}")
-    if code != 0 or last.get("step") != "done":
-        check_space(log.parent)
-        raise RunError(f"COLMAP failed with exit code {code}: {last_log_line(log)}; its log is {log}")
-    return last
-
-
-def check_space(folder: Path) -> None:
-    """Raise RunError if a file of 1 MiB cannot be written to `folder`. COLMAP's own messages do not
-    say that the disk is full."""
-    probe = folder / ".probe"
-    try:
-        write_bytes(probe, bytes(1 << 20))
-    finally:
-        probe.unlink(missing_ok=True)
-
-
-def last_log_line(log: Path) -> str:
-    """Return the last line that COLMAP logged, without its time and source location."""
-    lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
-    lines = [line for line in lines if not line.startswith(("@", "***", "PC:"))]  # a stack trace
-    return lines[-1].rpartition("] ")[2] if lines else "it logged nothing"
 
 
 def describe_result(

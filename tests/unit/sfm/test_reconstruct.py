@@ -12,13 +12,13 @@ import pytest
 import torch
 from PIL import Image
 
-from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.errors import InputError
 from scene_experts.sfm import reconstruct as run
 from scene_experts.sfm.learned import attempt
 from scene_experts.sfm.learned.weights import find_weights
 from scene_experts.sfm.options import SfmOptions
 from scene_experts.sfm.pairs import MOST_EXHAUSTIVE
-from scene_experts.sfm.reconstruct import LOG, NOTE
+from scene_experts.sfm.reconstruct import NOTE
 from scene_experts.sfm.work import NAME, PLACES
 from support.captures import load
 from support.messages import naming
@@ -245,21 +245,6 @@ def test_a_source_that_is_neither_folder_nor_video_is_reported(tmp_path, monkeyp
     with pytest.raises(InputError, match=r"pycolmap.*pip install .pycolmap"):
         make(write_black(tmp_path / "photos"), tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("code", "error", "fact"),
-    [
-        ("print('{\"step\": \"missing\", \"why\": \"no module\"}')", InputError, "no module"),
-        ("import os; print('{\"step\": \"features\"}', flush=True); os.abort()", RunError, "-6"),
-        ("import sys; sys.exit('E20261122 10:00 1 sqlite.h:9] disk is full')", RunError, "disk is full"),
-    ],
-)  # fmt: skip
-def test_a_failed_worker_is_reported(tmp_path, monkeypatch, code, error, fact):
-    (tmp_path / "worker.py").write_text(code)
-    monkeypatch.setattr(run.worker, "__file__", str(tmp_path / "worker.py"))
-    with pytest.raises(error, match=fact):
-        run.run_worker({"threads": 1, "pairs": ["x" * 200] * 1000}, tmp_path / LOG, lambda _: None, lambda *_: None)
 
 
 def test_the_features_of_many_photographs_decide_which_are_matched(tmp_path, monkeypatch):

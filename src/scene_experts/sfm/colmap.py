@@ -1,0 +1,91 @@
+"""Runs COLMAP in a process of its own, and tells what it says."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.extras import install_line
+from scene_experts.core.io import write_bytes
+from scene_experts.core.progress import Progress
+from scene_experts.sfm import worker
+
+Say = Callable[[str], None]
+
+
+def run_worker(request: dict[str, Any], log: Path, say: Say, progress: Progress) -> dict[str, Any]:
+    """Run COLMAP in a process of its own (`worker.py`) and return its last message.
+
+    Raises InputError if pycolmap cannot be used, RunError if the worker fails.
+    """
+    environment = {**os.environ, "OMP_NUM_THREADS": str(request["threads"])}
+    with log.open("w") as stream:
+        # -P: modules are not searched in the worker's folder. In a new session, because this
+        # process handles Ctrl-C.
+        process = subprocess.Popen(
+            [sys.executable, "-P", worker.__file__],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stream, text=True, env=environment, start_new_session=True,
+        )  # fmt: skip
+        assert process.stdin is not None and process.stdout is not None
+        last: dict[str, Any] = {}
+        try:
+            with suppress(BrokenPipeError):  # a worker that died at once: its exit code says so
+                process.stdin.write(json.dumps(request) + "\n")
+                process.stdin.flush()  # it stays open: the worker ends when this process does, however it ends
+            for line in process.stdout:
+                last = json.loads(line)
+                tell(last, say, progress)
+            code = process.wait()
+        finally:
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+            with suppress(BrokenPipeError):
+                process.stdin.close()
+    if last.get("step") == "missing":
+        raise InputError(f"pycolmap cannot be imported ({last['why']}): {install_line('sfm')}")
+    if code != 0 or last.get("step") != "done":
+        check_space(log.parent)
+        raise RunError(f"COLMAP failed with exit code {code}: {last_log_line(log)}; its log is {log}")
+    return last
+
+
+def tell(message: dict[str, Any], say: Say, progress: Progress) -> None:
+    """Pass on one message of the worker."""
+    step = message["step"]
+    if "total" in message:
+        progress(step, message["done"], message["total"])
+    elif step == "failed":
+        say(f"the {message['mapper']} mapper failed: {message['why']}")
+    elif step == "next mapper":
+        apart = f" in the largest of {message['parts']} parts, which do not fit together" if message["parts"] > 1 else ""
+        posed = f"gave {message['posed']} of {message['photographs']} photographs a pose{apart}"
+        say(f"the {message['mapper']} mapper {posed}; the global mapper runs too, and the better result is kept")
+    elif step == "weak":
+        say(f"{message['photographs']} photographs fit too few others; {message['pairs']:,} more pairs are matched for them")
+    elif step == "unread":
+        say(f"warning: COLMAP cannot read {', '.join(message['names'])}")
+
+
+def check_space(folder: Path) -> None:
+    """Raise RunError if a file of 1 MiB cannot be written to `folder`. COLMAP's own messages do not
+    say that the disk is full."""
+    probe = folder / ".probe"
+    try:
+        write_bytes(probe, bytes(1 << 20))
+    finally:
+        probe.unlink(missing_ok=True)
+
+
+def last_log_line(log: Path) -> str:
+    """Return the last line that COLMAP logged, without its time and source location."""
+    lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    lines = [line for line in lines if not line.startswith(("@", "***", "PC:"))]  # a stack trace
+    return lines[-1].rpartition("] ")[2] if lines else "it logged nothing"

@@ -1,0 +1,37 @@
+"""COLMAP in its own process: what it says is passed on, and how it ends is told."""
+
+import pytest
+
+from scene_experts.core.errors import InputError, RunError
+from scene_experts.sfm import colmap
+
+
+@pytest.mark.parametrize(
+    ("code", "error", "fact"),
+    [
+        ("print('{\"step\": \"missing\", \"why\": \"no module\"}')", InputError, "no module"),
+        ("import os; print('{\"step\": \"features\"}', flush=True); os.abort()", RunError, "-6"),
+        ("import sys; sys.exit('E20261122 10:00 1 sqlite.h:9] disk is full')", RunError, "disk is full"),
+    ],
+)  # fmt: skip
+def test_a_failed_worker_is_reported(tmp_path, monkeypatch, code, error, fact):
+    (tmp_path / "worker.py").write_text(code)
+    monkeypatch.setattr(colmap.worker, "__file__", str(tmp_path / "worker.py"))
+    with pytest.raises(error, match=fact):
+        colmap.run_worker({"threads": 1, "pairs": ["x" * 200] * 1000}, tmp_path / "colmap.log", lambda _: None, lambda *_: None)
+
+
+def test_each_message_of_the_worker_is_told():
+    said, shown = [], []
+    messages = [
+        {"step": "features", "done": 1, "total": 3},
+        {"step": "failed", "mapper": "incremental", "why": "no pair"},
+        {"step": "next mapper", "mapper": "incremental", "parts": 2, "posed": 2, "photographs": 6},
+        {"step": "weak", "photographs": 4, "pairs": 1200},
+        {"step": "unread", "names": ["a.jpg", "b.jpg"]},
+        {"step": "done", "registered": []},
+    ]
+    for message in messages:
+        colmap.tell(message, said.append, lambda *work: shown.append(work))
+    assert shown == [("features", 1, 3)] and len(said) == 4
+    assert "2 of 6" in said[1] and "2 parts" in said[1] and "1,200" in said[2] and "a.jpg, b.jpg" in said[3]
