@@ -129,8 +129,8 @@ def _make_pictures(painter: Painter, capture: Capture) -> _Pictures:
     first = find_first_views(capture, lambda camera: painter.rasterize(painter.gaussians(camera), camera, black))
     every, generator = Views.of(capture), torch.Generator().manual_seed(0)
     views = [capture.views[i].camera for i in evenly(capture.train, VIEWS)] + [every.free(generator) for _ in range(FREE_VIEWS)]
-    limited = [[_limit(camera) for camera in cameras] for cameras in (views, [view.camera for view in first])]
-    return _Pictures(painter, torch.tensor(capture.background), *limited, {})
+    background, filled = torch.tensor(capture.background), [_limit(view.camera) for view in first]
+    return _Pictures(painter, background, [_limit(camera) for camera in views], filled, {})
 
 
 def _limit(camera: Camera) -> Camera:

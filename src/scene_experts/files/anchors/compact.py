@@ -48,14 +48,7 @@ MOST_ANCHORS, MOST_CHANNELS, MOST_SLOTS = 1 << 28, 1024, 256  # of a file; F and
 MOST_TENSORS, MOST_VALUES = 1000, 1 << 28
 BYTES_PER_VALUE = 16  # in memory, while a file is read
 POSITIONS, MODELS, NETWORKS, EXACT = "positions", "models", "networks", "exact"  # names of parts, beside those of the groups
-_LABELS = {
-    "class": "classes",
-    "feature": "features",
-    "scaling": "scalings",
-    "slots": "masks",
-    "models": "context models",
-    "exact": "routers",
-}
+_LABELS = {"class": "classes", "feature": "features", "scaling": "scalings", "slots": "masks", "models": "context models", "exact": "routers"}
 
 
 @dataclass(frozen=True)
