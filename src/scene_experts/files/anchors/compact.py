@@ -48,7 +48,7 @@ MOST_ANCHORS, MOST_CHANNELS, MOST_SLOTS = 1 << 28, 1024, 256  # of a file; F and
 MOST_TENSORS, MOST_VALUES = 1000, 1 << 28
 BYTES_PER_VALUE = 16  # in memory, while a file is read
 POSITIONS, MODELS, NETWORKS, EXACT = "positions", "models", "networks", "exact"  # names of parts, beside those of the groups
-_LABELS = {"class": "classes", "feature": "features", "scaling": "scalings", "slots": "masks", "models": "context models", "exact": "routers"}
+_SAID = {"class": "classes", "feature": "features", "scaling": "scalings", "slots": "masks", "models": "context models", "exact": "routers"}
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Sizes:
         return self.total / max(self.anchors, 1)
 
     def __str__(self) -> str:
-        parts = {_LABELS.get(name, name): size for name, size in self.parts.items() if size}
+        parts = {_SAID.get(name, name): size for name, size in self.parts.items() if size}
         parts["header"] = self.total - sum(self.parts.values())
         return f"{self.per_anchor:.1f} bytes per anchor: " + ", ".join(f"{name} {size:,}" for name, size in parts.items())
 
