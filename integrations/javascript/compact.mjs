@@ -15,13 +15,14 @@ const ROOTS = [
   67018073, 67063453, 67086155, 67097508, 67103186, 67106025, 67107444, 67108154,
 ];
 const ONE = 2 ** 26, SHARE = 2 ** 20; // products of these stay below 2^53, so numbers are exact
-const MANTISSA = 80, STEP = 24, UNIT = 32, REACH = 2047, LARGEST = 1 << 26;
-const LOW_CLASS = -2, CLASSES = 7, LEVELS = 3;
+export const UNIT = 32;
+const MANTISSA = 80, STEP = 24, REACH = 2047, LARGEST = 1 << 26;
+export const LOW_CLASS = -2, CLASSES = 7, LEVELS = 3;
 
-function fail(what) {
+export function fail(what) {
   throw new Error(`expected a compact file that this version reads, found ${what}`);
 }
-const clamp = (value, low, high) => (value < low ? low : value > high ? high : value);
+export const clamp = (value, low, high) => (value < low ? low : value > high ? high : value);
 
 // ---- Tables -----------------------------------------------------------------------------------------------------------------------------
 
@@ -58,7 +59,7 @@ const zeros = Array.from({ length: TOP + 1 }, (_, odds) => {
 
 // ---- Streams ----------------------------------------------------------------------------------------------------------------------------
 
-class Reader {
+export class Reader {
   constructor(bytes) {
     if (bytes.length % 2 || bytes.length < 4 * LANES) fail("a stream that is cut short");
     this.words = new Uint16Array(bytes.slice().buffer);
@@ -186,7 +187,7 @@ function readCells(reader, depth, count) {
 }
 
 // The bit of the highest axis in which two cells of `fine` differ decides, z before y before x.
-function compareMorton(fine, i, j) {
+export function compareMorton(fine, i, j) {
   let axis = 2, most = fine[3 * i + 2] ^ fine[3 * j + 2];
   for (let a = 1; a >= 0; --a) {
     const found = fine[3 * i + a] ^ fine[3 * j + a];
@@ -205,14 +206,14 @@ function sameBox(fine, i, j, bits) {
 }
 
 // Rows [n, 3] of an array, by their numbers.
-function pick(from, rows, Kind) {
+export function pick(from, rows, Kind) {
   const out = new Kind(3 * rows.length);
   for (let i = 0; i < rows.length; ++i) for (let a = 0; a < 3; ++a) out[3 * i + a] = from[3 * rows[i] + a];
   return out;
 }
 
 // Cells, lattices and fine cells of all anchors, along the curve.
-function readPlaces(header, reader) {
+export function readPlaces(header, reader) {
   const N = header.N;
   let own = new Float64Array(3 * N), lattice = new Uint8Array(N), wide = new Float64Array(3 * N), at = 0;
   header.lattices.forEach(([, , multiple, low, count, distinct, depth], number) => {
@@ -244,7 +245,7 @@ function readPlaces(header, reader) {
 
 // ---- Models -----------------------------------------------------------------------------------------------------------------------------
 
-function makeGroups(header) {
+export function makeGroups(header) {
   const group = (name, channels, own, more) => ({ name, channels, own, parents: true, chain: true, steps: true, ...more });
   const groups = [group("class", 1, [], { steps: false }), group("feature", header.F, []), group("scaling", 6, ["feature"])];
   if (header.extra.length) groups.push(group("extra", header.extra.length, ["scaling"], { steps: false }));
@@ -270,14 +271,14 @@ function readCoarse(reader, count) {
   const mantissas = reader.symbols(count, MANTISSA), exponents = readDifferences(reader, count, 0, 30);
   return Array.from(mantissas, (v, i) => v * 2 ** exponents[i]);
 }
-function readModel(reader, group) {
+export function readModel(reader, group) {
   const C = group.channels, model = { weights: [] };
   model.meanBias = readCoarse(reader, C);
   model.scaleBias = readCoarse(reader, C);
   model.meanShift = readDifferences(reader, C, -24, 24);
   model.scaleShift = readDifferences(reader, C, -24, 24);
-  model.factor = readCoarse(reader, C);
-  model.offset = readCoarse(reader, C);
+  model.factor = readCoarse(reader, group.refines ? 0 : C);
+  model.offset = readCoarse(reader, group.refines ? 0 : C);
   const scales = [readDifferences(reader, C, 0, TOP), readDifferences(reader, C, 0, TOP)];
   for (let c = 0; c < C; ++c) model.weights.push(scales.map((scale) => reader.symbols(group.inputs[c], scale[c])));
   return model;
@@ -291,7 +292,7 @@ function shifted(sum, shift) {
 }
 
 // Four parents of each anchor in coding order, and their weights, [N, 4] each. curve: coding place of each anchor along the curve.
-function findParents(fine, curve, level) {
+export function findParents(fine, curve, level) {
   const found = new Int32Array(4 * curve.length), weights = new Int32Array(4 * curve.length);
   for (let own = 1; own < LEVELS; ++own) {
     const coarse = [];
@@ -341,7 +342,7 @@ function makeInputs(g, width, level, begin, end, values, columns, parents) {
 }
 
 // Reads one channel of the anchors from `begin` to `end`. kept: whether its values are inputs later.
-function readChannel(g, c, model, reader, inputs, width, begin, end, classes, live, to, column, kept) {
+export function readChannel(g, c, model, reader, inputs, width, begin, end, classes, live, to, column, kept) {
   const [w, v] = model.weights[c], D = g.inputs[c], factor = model.factor[c], offset = model.offset[c];
   const meanBias = model.meanBias[c], scaleBias = model.scaleBias[c], meanShift = model.meanShift[c], scaleShift = model.scaleShift[c];
   for (let i = begin, row = 0; i < end; ++i, row += width) {
@@ -412,26 +413,32 @@ const crcTable = Uint32Array.from({ length: 256 }, (_, n) => {
   for (let k = 0; k < 8; ++k) n = n & 1 ? (n >>> 1) ^ 0xedb88320 : n >>> 1;
   return n;
 });
-function crc32(bytes, before = 0) {
+export function crc32(bytes, before = 0) {
   let c = ~before;
   for (let i = 0; i < bytes.length; ++i) c = crcTable[(c ^ bytes[i]) & 255] ^ (c >>> 8);
   return ~c >>> 0;
 }
-const bytesOf = (numbers) => new Uint8Array(numbers.buffer, numbers.byteOffset, numbers.byteLength); // browsers run on little-endian machines
-async function inflate(bytes) {
+export const bytesOf = (numbers) => new Uint8Array(numbers.buffer, numbers.byteOffset, numbers.byteLength); // browsers run on little-endian machines
+export async function inflate(bytes) {
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-export async function readCompact(bytes) {
+// The header and the parts by name of a file that begins with `mark`.
+export async function open(bytes, mark, version) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
-  if (bytes.length < 16 || new TextDecoder("latin1").decode(bytes.subarray(0, 8)) !== "SXCOMP2\n") fail("another kind of file");
+  if (bytes.length < 16 || new TextDecoder("latin1").decode(bytes.subarray(0, 8)) !== mark) fail("another kind of file");
   if (crc32(bytes.subarray(0, -4)) !== view.getUint32(bytes.length - 4, true)) fail("bytes with another checksum");
   let at = 12 + view.getUint32(8, true);
   const header = JSON.parse(new TextDecoder().decode(await inflate(bytes.subarray(12, at))));
-  if (header.version !== 2) fail(`version ${header.version}`);
+  if (header.version !== version) fail(`version ${header.version}`);
   const parts = {};
   for (const [name, length] of header.parts) parts[name] = bytes.subarray(at, (at += length));
+  return { header, parts };
+}
+
+export async function readCompact(bytes) {
+  const { header, parts } = await open(bytes, "SXCOMP2\n", 2);
 
   // the order: level by level, along the curve within a level
   const { own, lattice, fine } = readPlaces(header, new Reader(parts.positions)), N = header.N;

@@ -21,10 +21,11 @@ class Options:
     """Draw the held-out views from the run and from the file, and say what the file costs in
     PSNR."""
     quality: float = 0.2
-    """compact, html: dB of PSNR that the training views may lose; held-out views lose less."""
+    """compact, html, streamed-html: dB of PSNR that the training views may lose; held-out views lose
+    less."""
     target_mb: float = 0.0
-    """compact, html: write a file of at most this many megabytes (10^6 bytes), as good as it can be,
-    in place of --quality; 0: any size."""
+    """compact, html, streamed-html: write a file of at most this many megabytes (10^6 bytes), as good
+    as it can be, in place of --quality; 0: any size."""
     sh_degree: int = MAX_DEGREE
     """Standard files: degree of the spherical harmonics, 0 (smallest file) to 3 (best)."""
     max_gaussians: int = 0

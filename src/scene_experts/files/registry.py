@@ -47,6 +47,7 @@ FORMATS = {
     "mesh": "scene_experts.files.mesh",
     "baked-html": "scene_experts.files.formats.html",
     "html": "scene_experts.files.anchors.live",
+    "streamed-html": "scene_experts.files.anchors.streamed",
 }
 """Name on the command line -> module that states the format as `FORMAT`."""
 

@@ -116,6 +116,8 @@ export class Gpu {
   constructor(device) {
     this.device = device;
     this.bytes = 0;
+    this.made = []; // buffers
+    this.pipelines = new Map(); // by what they are made of: a compilation takes long
     this.errors = [];
     device.addEventListener("uncapturederror", (event) => this.errors.push(event.error.message));
   }
@@ -124,6 +126,13 @@ export class Gpu {
     const made = this.device.createBuffer({ size: bytes, usage: usage | also });
     if (data) this.device.queue.writeBuffer(made, 0, data);
     this.bytes += bytes;
+    this.made.push(made);
+    return made;
+  }
+  // The buffers so far, which the caller will destroy.
+  release() {
+    const { made } = this;
+    Object.assign(this, { made: [], bytes: 0 });
     return made;
   }
   bind(pipeline, resources) {
@@ -131,16 +140,26 @@ export class Gpu {
     return this.device.createBindGroup({ layout: pipeline.getBindGroupLayout(0), entries });
   }
   compute(code, buffers, constants) {
-    const module = this.device.createShaderModule({ code });
-    const pipeline = this.device.createComputePipeline({ layout: "auto", compute: { module, entryPoint: "main", constants } });
+    const pipeline = this.once([code, constants], () => {
+      const module = this.device.createShaderModule({ code });
+      return this.device.createComputePipeline({ layout: "auto", compute: { module, entryPoint: "main", constants } });
+    });
     const group = this.bind(pipeline, buffers);
     const set = (pass) => (pass.setPipeline(pipeline), pass.setBindGroup(0, group), pass);
     return { dispatch: (pass, n) => set(pass).dispatchWorkgroups(n), indirect: (pass, args) => set(pass).dispatchWorkgroupsIndirect(args, 0) };
   }
   pipeline(code, format, topology, blend) {
-    const module = this.device.createShaderModule({ code });
-    const fragment = { module, targets: [{ format, blend }] };
-    return this.device.createRenderPipeline({ layout: "auto", vertex: { module }, primitive: { topology }, fragment });
+    return this.once([code, format, topology, blend], () => {
+      const module = this.device.createShaderModule({ code });
+      const fragment = { module, targets: [{ format, blend }] };
+      return this.device.createRenderPipeline({ layout: "auto", vertex: { module }, primitive: { topology }, fragment });
+    });
+  }
+  // A pipeline for a description, made at most once.
+  once(description, make) {
+    const key = JSON.stringify(description);
+    if (!this.pipelines.has(key)) this.pipelines.set(key, make());
+    return this.pipelines.get(key);
   }
   read(buffer, size = buffer.size) {
     return this.gather(buffer, [0], size);

@@ -15,7 +15,8 @@ class OnGpu {
   static async open(ask, settings, canvas, view, lost) {
     if (!navigator.gpu) return null;
     const scene = await ask("pack", { exact: settings.exact === true });
-    const gpu = await Gpu.open(GpuRenderer.largest(scene), lost);
+    const part = Math.max(1, settings.count / Math.max(1, scene.N * scene.K)); // of a scene that is not here yet
+    const gpu = await Gpu.open(part * GpuRenderer.largest(scene), lost);
     if (!gpu) return null;
     try {
       return await OnGpu.begin(gpu, scene, ask, settings, canvas, view);
@@ -49,6 +50,15 @@ class OnGpu {
     if (fresh) this.at = view.position;
     return this.renderer.render(view, fresh);
   }
+  // Draws what the worker has now, at once and from now on: a renderer without a picture would show an empty canvas. view(): what to draw.
+  async refresh(ask, view) {
+    const scene = await ask("pack", { exact: this.settings.exact === true }), before = this.renderer, buffers = before.gpu.release();
+    this.renderer = new GpuRenderer(before.gpu, scene, this.settings, before.canvas);
+    this.at = null;
+    await this.draw(view(), false);
+    buffers.forEach((buffer) => buffer.destroy());
+    before.texture?.destroy();
+  }
 }
 
 class OnGl {
@@ -74,6 +84,16 @@ class OnGl {
   }
   get isFinal() {
     return !this.busy && this.isCurrent;
+  }
+  // As OnGpu.refresh.
+  async refresh(ask, view) {
+    while (this.busy) await new Promise((done) => setTimeout(done, 20));
+    this.busy = true;
+    try {
+      await this.decode(view());
+    } finally {
+      this.busy = false;
+    }
   }
   draw(view, moving) {
     const isDecoded = moving || String(this.at) === String(view.position), isSorted = String(this.row) === String(view.rows[2]);

@@ -16,8 +16,11 @@ function bytesOf(text) {
 }
 
 // text: a compact file in base64.
-export async function openScene(text, settings) {
-  const scene = makeScene(await readCompact(bytesOf(text)), settings);
+export const openScene = async (text, settings) => sceneOf(await readCompact(bytesOf(text)), settings);
+
+// compact: what readCompact returns.
+export function sceneOf(compact, settings) {
+  const scene = makeScene(compact, settings);
   scene.levels = settings.levels;
   scene.smoothing = settings.smoothing;
   return scene;
@@ -30,14 +33,18 @@ function buffersOf(value, found = new Set()) {
   return [...found];
 }
 
-// Requests have a number and get one answer: its result, or the message of an Error.
-export function serve(scope) {
+// Requests have a number and get one answer: its result, or the message of an Error. more(use): further acts; use(scene) is the scene from
+// now on, whose Gaussians are decoded at the next request for them.
+export function serve(scope, more = () => ({})) {
   let scene = null, decoder = null, words = null;
+  const use = (found) => {
+    scene = found;
+    decoder = null;
+    return { N: scene.N, K: scene.K };
+  };
   const acts = {
-    open: async ({ text, settings }) => {
-      scene = await openScene(text, settings);
-      return { N: scene.N, K: scene.K };
-    },
+    ...more(use),
+    open: async ({ text, settings }) => use(await openScene(text, settings)),
     pack: ({ exact }) => packScene(scene, exact),
     decode: ({ position, row, near }) => {
       decoder ??= new CpuDecoder(scene);

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_bytes
@@ -32,7 +33,7 @@ from scene_experts.files.anchors.rounding import FURTHER, WholeScene, restore, r
 from scene_experts.files.anchors.sensitivity import prepare
 from scene_experts.files.codec import container
 from scene_experts.files.codec.fit import fit_models
-from scene_experts.files.codec.groups import EXTRA, FEATURE, OFFSETS, ORDER, SCALING, SLOTS, Walk, anchor_groups
+from scene_experts.files.codec.groups import EXTRA, FEATURE, OFFSETS, ORDER, SCALING, SLOTS, ChannelGroup, Walk, anchor_groups
 from scene_experts.files.codec.numbers import Rounded, code_models, code_rounded, reading, writing
 from scene_experts.files.codec.order import CodingOrder, choose_boxes
 from scene_experts.files.codec.streams import SymbolReader, SymbolWriter
@@ -47,14 +48,7 @@ MOST_ANCHORS, MOST_CHANNELS, MOST_SLOTS = 1 << 28, 1024, 256  # of a file; F and
 MOST_TENSORS, MOST_VALUES = 1000, 1 << 28
 BYTES_PER_VALUE = 16  # in memory, while a file is read
 POSITIONS, MODELS, NETWORKS, EXACT = "positions", "models", "networks", "exact"  # names of parts, beside those of the groups
-_LABELS = {
-    "class": "classes",
-    "feature": "features",
-    "scaling": "scalings",
-    "slots": "masks",
-    "models": "context models",
-    "exact": "routers",
-}
+_SAID = {"class": "classes", "feature": "features", "scaling": "scalings", "slots": "masks", "models": "context models", "exact": "routers"}
 
 
 @dataclass(frozen=True)
@@ -72,7 +66,7 @@ class Sizes:
         return self.total / max(self.anchors, 1)
 
     def __str__(self) -> str:
-        parts = {_LABELS.get(name, name): size for name, size in self.parts.items() if size}
+        parts = {_SAID.get(name, name): size for name, size in self.parts.items() if size}
         parts["header"] = self.total - sum(self.parts.values())
         return f"{self.per_anchor:.1f} bytes per anchor: " + ", ".join(f"{name} {size:,}" for name, size in parts.items())
 
@@ -89,48 +83,73 @@ def write(path: Path, data: AnchorData, note: dict[str, Any]) -> Sizes:
     return sizes
 
 
-def encode(data: AnchorData) -> tuple[bytes, Sizes]:
-    """The bytes of a scene's file, and their sizes. Raises InputError as `write`."""
+@dataclass(frozen=True)
+class Arranged:
+    """A scene as whole numbers, in the order in which its file codes them."""
+
+    places: AnchorPlaces
+    rows: NDArray[np.int64]
+    """[N], of the scene"""
+    way: CodingOrder
+    boxes: tuple[int, int]
+    whole: WholeScene
+    groups: tuple[ChannelGroup, ...]
+
+
+def arrange(data: AnchorData) -> Arranged:
+    """The whole numbers of a scene. Raises InputError as `write`."""
     places, along = find_places(data)
-    n, F, K = len(along), data.columns["feature"].shape[1], data.columns["offsets"].shape[1]
+    F, K = data.columns["feature"].shape[1], data.columns["offsets"].shape[1]
     if F > MOST_CHANNELS or K > MOST_SLOTS:
         raise InputError(f"expected at most {MOST_CHANNELS} channels and {MOST_SLOTS} Gaussians for a compact file, found {F} and {K}")
     whole = round_scene(data)
     boxes = choose_boxes(places.keys)
     way = CodingOrder.of(places.keys, boxes)
-    places, along = places.ordered(way.rows), along[way.rows]
-    values = {name: np.ascontiguousarray(value[:, along]) for name, value in whole.values.items()}
-    groups = anchor_groups(F, K, SLOTS in values, len(whole.extra))
-    models = fit_models(groups, way, values)
+    rows = along[way.rows]
+    values = {name: np.ascontiguousarray(value[:, rows]) for name, value in whole.values.items()}
+    return Arranged(
+        places.ordered(way.rows), rows, way, boxes, replace(whole, values=values), anchor_groups(F, K, SLOTS in values, len(whole.extra))
+    )
+
+
+def encode(data: AnchorData) -> tuple[bytes, Sizes]:
+    """The bytes of a scene's file, and their sizes. Raises InputError as `write`."""
+    return encode_arranged(data, arrange(data))
+
+
+def encode_arranged(data: AnchorData, found: Arranged) -> tuple[bytes, Sizes]:
+    """The bytes of the file of a scene of which `arrange` found the whole numbers, and their sizes."""
+    places, way, whole, groups = found.places, found.way, found.whole, found.groups
+    models = fit_models(groups, way, whole.values)
     cells, numbers, weights = SymbolWriter(), SymbolWriter(), SymbolWriter()
     write_places(places, cells)
     models = code_models(writing(numbers), groups, models)
     for rounded in whole.networks.values():
         code_rounded(writing(weights), (len(rounded.values), *rounded.values.shape[1:]), rounded)
     parts = {POSITIONS: cells.pack(), MODELS: numbers.pack()}
-    parts |= {name: stream.pack() for name, stream in Walk(groups, way, models).write(values).items()}
+    parts |= {name: stream.pack() for name, stream in Walk(groups, way, models).write(whole.values).items()}
     exact = zlib.compress(b"".join(value.astype("<f4").tobytes() for value in whole.exact.values()), 9)
     parts |= {NETWORKS: weights.pack(), EXACT: exact}
     header = {
         "version": VERSION,
-        "N": n,
-        "F": F,
-        "K": K,
-        "slots": SLOTS in values,
+        "N": len(found.rows),
+        "F": data.columns["feature"].shape[1],
+        "K": data.columns["offsets"].shape[1],
+        "slots": SLOTS in whole.values,
         "extra": whole.extra,
         "steps": whole.steps,
         "levels": bool(data.edges),
         "lattices": [lattice.plain() for lattice in places.lattices],
         "origin": list(data.origin),
         "voxel": data.voxel,
-        "boxes": list(boxes),
+        "boxes": list(found.boxes),
         "networks": [[name, list(data.networks[name].shape)] for name in (*whole.networks, *whole.exact)],
         "rounded": len(whole.networks),
-        "integers": checksum(places, replace(whole, values=values)),
+        "integers": checksum(places, whole),
         "scene": data.about,
     }
     encoded = container.join(header, parts)
-    return encoded, Sizes(len(encoded), {name: len(part) for name, part in parts.items()}, n)
+    return encoded, Sizes(len(encoded), {name: len(part) for name, part in parts.items()}, len(found.rows))
 
 
 def checksum(places: AnchorPlaces, whole: WholeScene) -> int:
@@ -158,9 +177,46 @@ def read(path: Path) -> AnchorData:
         return decode(source.read(), source)
 
 
+@dataclass(frozen=True)
+class CompactScene:
+    """What a file holds, in coding order."""
+
+    header: dict[str, Any]
+    places: AnchorPlaces
+    origin: tuple[float, float, float]
+    whole: WholeScene
+    shapes: dict[str, tuple[int, ...]]
+    """Of the networks' tensors."""
+
+    def restored(self) -> AnchorData:
+        """The scene. Raises Damaged for numbers that are no scene."""
+        header, about = self.header, self.about
+        columns = self.places.columns(self.origin)
+        has_levels = header["levels"] is True
+        columns |= {"level": self.places.levels()} if has_levels else {}
+        voxel = number(header["voxel"], "the edge of a cell", 0, FARTHEST)
+        step = whole_number((about or {}).get("step", 0), "the iteration")
+        add_dist = tuple(a for a, used in (about or {}).get("add_dist", {}).items() if used)
+        found = AnchorData(columns, {}, about, None, voxel, self.origin, add_dist, step)  # type: ignore[arg-type]
+        found = restore(self.whole, found, self.shapes)
+        if not has_levels:
+            found = replace(found, cells=torch.from_numpy(self.places.cells))
+        return found.checked()
+
+    @property
+    def about(self) -> dict[str, Any] | None:
+        """The description of the scene."""
+        return dict(self.header["scene"]) if self.header["scene"] is not None else None
+
+
 def decode(data: bytes, source: Source) -> AnchorData:
     """The scene in the bytes of a file, which were read from `source`. Raises CutShort and Damaged
     for damaged ones."""
+    return decode_whole(data, source).restored()
+
+
+def decode_whole(data: bytes, source: Source) -> CompactScene:
+    """The whole numbers in the bytes of a file. Raises as `decode`."""
     header, parts = container.part(data)
     if header["version"] != VERSION:
         raise Damaged(f"version {header['version']!r} of the format, not {VERSION}")
@@ -188,21 +244,10 @@ def decode(data: bytes, source: Source) -> AnchorData:
     values = Walk(groups, way, models).read(parts)
     source.check_time()
     count = whole_number(header["rounded"], "the number of networks", 0, len(shapes))
-    whole = WholeScene(values, _steps(header["steps"], F, K, extra), extra, *_networks(parts, shapes, count))
+    whole = WholeScene(values, steps_of(header["steps"], F, K, extra), extra, *_networks(parts, shapes, count))
     if checksum(places, whole) != header["integers"]:
         raise Damaged("numbers with another checksum")
-    about = dict(header["scene"]) if header["scene"] is not None else None
-    columns = places.columns(origin)  # type: ignore[arg-type]
-    has_levels = header["levels"] is True
-    columns |= {"level": places.levels()} if has_levels else {}
-    voxel = number(header["voxel"], "the edge of a cell", 0, FARTHEST)
-    step = whole_number((about or {}).get("step", 0), "the iteration")
-    add_dist = tuple(a for a, used in (about or {}).get("add_dist", {}).items() if used)
-    found = AnchorData(columns, {}, about, None, voxel, origin, add_dist, step)  # type: ignore[arg-type]
-    found = restore(whole, found, shapes)
-    if not has_levels:
-        found = replace(found, cells=torch.from_numpy(places.cells))
-    return found.checked()
+    return CompactScene(header, places, origin, whole, shapes)  # type: ignore[arg-type]
 
 
 def _shapes(listed: Any) -> dict[str, tuple[int, ...]]:
@@ -217,7 +262,8 @@ def _shapes(listed: Any) -> dict[str, tuple[int, ...]]:
     return out
 
 
-def _steps(value: Any, F: int, K: int, extra: list[str]) -> dict[str, list[float]]:
+def steps_of(value: Any, F: int, K: int, extra: list[str]) -> dict[str, list[float]]:
+    """The steps of a header by group. Raises Damaged for others."""
     wanted = {FEATURE: F, SCALING: 6, OFFSETS: 3 * K} | ({EXTRA: len(extra)} if extra else {})
     found = {name: [number(v, "a step", 1e-30, LARGEST) for v in value[name]] for name in wanted}
     if any(len(found[name]) != size for name, size in wanted.items()):

@@ -125,7 +125,7 @@ def page_settings(data: AnchorData, note: Mapping[str, Any]) -> dict[str, Any]:
         "router": _positions(about, centre),
         "levels": _levels(about),
         "smoothing": float(config.get("smoothing", 0.0)) if "interval" in data.columns else 0.0,
-        "exact": not _fits_halves(data),
+        "exact": not fits_halves(data),
     }
 
 
@@ -174,7 +174,7 @@ def _levels(about: Mapping[str, Any]) -> dict[str, Any] | None:
     return {"edges": edges, "standard": levels.standard / scale, "fork": levels.fork, "rule": levels.rule}
 
 
-def _fits_halves(data: AnchorData) -> bool:
+def fits_halves(data: AnchorData) -> bool:
     """Whether 16 bits hold the values of a scene; sizes are held relative to their median."""
     values = [data.columns["feature"], data.columns["offsets"], *data.networks.values()]
     sizes = data.columns["log_scaling"]

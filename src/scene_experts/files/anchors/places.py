@@ -103,7 +103,7 @@ def find_places(data: AnchorData) -> tuple[AnchorPlaces, NDArray[np.int64]]:
     multiples = [_multiple(edges[j], edges[held[-1]]) for j in held]
     lattice = np.searchsorted(held, level)
     fine = cells * np.array(multiples or [1])[lattice][:, None]
-    fine = _from_zero(fine)
+    fine = from_zero(fine)
     keys = morton(fine)
     order = np.lexsort((lattice, keys))
     lattices = []
@@ -124,7 +124,7 @@ def _multiple(edge: float, finest: float) -> int:
     return found
 
 
-def _from_zero(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+def from_zero(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     """Cells relative to their least coordinates. Raises InputError for a wide scene."""
     low = cells.min(0) if len(cells) else np.zeros(3, np.int64)
     spread = int((cells.max(0) - low).max()) if len(cells) else 0
@@ -162,7 +162,7 @@ def read_places(lattices: list[Lattice], reader: SymbolReader) -> AnchorPlaces:
     reader.finish()
     cells, lattice_of = np.concatenate(own), np.concatenate(index)
     try:
-        keys = morton(_from_zero(np.concatenate(fine)))
+        keys = morton(from_zero(np.concatenate(fine)))
     except InputError as error:
         raise Damaged(str(error)) from None
     order = np.lexsort((lattice_of, keys)) if len(lattices) > 1 else np.arange(len(keys))

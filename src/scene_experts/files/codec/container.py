@@ -23,25 +23,25 @@ MARK = b"SXCOMP2\n"
 _LENGTH = 4  # bytes of a number
 
 
-def join(header: Mapping[str, Any], parts: Mapping[str, bytes]) -> bytes:
-    """The bytes of a file. header: JSON values without "parts"."""
+def join(header: Mapping[str, Any], parts: Mapping[str, bytes], mark: bytes = MARK) -> bytes:
+    """The bytes of a file. header: JSON values without "parts"; mark: 8 bytes."""
     listed = {**header, "parts": [[name, len(part)] for name, part in parts.items()]}
     text = zlib.compress(json.dumps(listed, allow_nan=False, separators=(",", ":")).encode(), 9)
-    data = b"".join([MARK, len(text).to_bytes(_LENGTH, "little"), text, *parts.values()])
+    data = b"".join([mark, len(text).to_bytes(_LENGTH, "little"), text, *parts.values()])
     return data + zlib.crc32(data).to_bytes(_LENGTH, "little")
 
 
-def part(data: bytes) -> tuple[dict[str, Any], dict[str, bytes]]:
+def part(data: bytes, mark: bytes = MARK) -> tuple[dict[str, Any], dict[str, bytes]]:
     """The header and the parts by name of the bytes of a file.
 
     Raises CutShort for bytes that lack some or whose checksum is wrong, and Damaged for others.
     """
-    if not data.startswith(MARK):
+    if not data.startswith(mark):
         raise Damaged("no compact scene")
-    start = len(MARK) + _LENGTH
+    start = len(mark) + _LENGTH
     if len(data) < start + _LENGTH or zlib.crc32(data[:-_LENGTH]) != int.from_bytes(data[-_LENGTH:], "little"):
         raise CutShort("bytes with another checksum")
-    at = start + int.from_bytes(data[len(MARK) : start], "little")
+    at = start + int.from_bytes(data[len(mark) : start], "little")
     machine = zlib.decompressobj()
     text = machine.decompress(data[start:at], HEADER.bytes_in + 1)
     if not machine.eof or len(text) > HEADER.bytes_in:

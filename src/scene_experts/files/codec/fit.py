@@ -33,7 +33,7 @@ _OCTAVE = 8 / math.log(2)
 def fit_models(groups: Sequence[ChannelGroup], order: CodingOrder, values: Mapping[str, Ints]) -> dict[str, GroupModel]:
     """Models by group of values by group, [C, N] int32 in coding order."""
     channels = {g.name: g.channels for g in groups}
-    models = {g.name: _blank(g, channels, values) for g in groups}
+    models = {g.name: blank_model(g, channels, values[g.name], values[CLASS][0]) for g in groups}
     walk = Walk(groups, order, models)
     walk.values = {name: np.ascontiguousarray(value, np.int32) for name, value in values.items()}
     every = max(1, -(-walk.count // ROWS))
@@ -52,21 +52,24 @@ def fit_models(groups: Sequence[ChannelGroup], order: CodingOrder, values: Mappi
         rows = np.concatenate([np.arange(places.start, places.stop, every) for places in order.levels])
         live = walk.values[SLOTS][:, rows] != 0 if group.masked else None
         with one_thread():
-            models[group.name] = _fit(
+            models[group.name] = fit_model(
                 group, models[group.name], np.concatenate(parts, 1), walk.values[group.name][:, rows], classes[rows], live
             )
     return models
 
 
-def _blank(group: ChannelGroup, channels: Mapping[str, int], values: Mapping[str, Ints]) -> GroupModel:
-    """A model that predicts the same of every anchor, with the scaling of its values as inputs."""
-    value = values[group.name].astype(np.float64)
+def blank_model(group: ChannelGroup, channels: Mapping[str, int], values: Ints, classes: Ints) -> GroupModel:
+    """A model that predicts the same of every anchor, with the scaling of its values [C, N] as
+    inputs. channels: of the groups by name; classes: [N]."""
+    weights = [np.zeros((2, D), np.int8) for D in inputs_of(group, channels)]
+    if group.refines:
+        return GroupModel(weights, np.zeros((group.channels, 4), np.int32), np.zeros((0, 2), np.int32))
+    value = values.astype(np.float64)
     if group.has_steps:
-        value = value * 2.0 ** values[CLASS]
+        value = value * 2.0**classes
     mean, deviation = (value.mean(1), value.std(1)) if value.shape[1] else (np.zeros(len(value)), np.ones(len(value)))
     factor = np.array([_coarse(v, 1, MOST_FACTOR) for v in UNIT * 1024 / np.maximum(deviation, 0.05)])
     offset = np.array([_coarse(v, -MOST_OFFSET, MOST_OFFSET) for v in mean * 4 * factor])
-    weights = [np.zeros((2, D), np.int8) for D in inputs_of(group, channels)]
     return GroupModel(weights, np.zeros((group.channels, 4), np.int32), np.stack([factor, offset], 1).astype(np.int32))
 
 
@@ -86,7 +89,7 @@ def _coarse(value: float, low: int, high: int) -> int:
     return min(max(mantissa << exponent if mantissa >= 0 else -(-mantissa << exponent), low), high)
 
 
-def _fit(
+def fit_model(
     group: ChannelGroup,
     blank: GroupModel,
     inputs: NDArray[np.int16],
@@ -108,7 +111,7 @@ def _fit(
         return _whole(blank, torch.zeros_like(spread), torch.zeros(C), spread, bias, mask, binary=True)
     base = y * 2.0**k
     deviation, middle = base.std(0, correction=0) + 1e-2, base.mean(0)
-    mean, bias, means = torch.zeros(C, X.shape[1]), torch.zeros(C), group.from_parents or group.is_chain
+    mean, bias, means = torch.zeros(C, X.shape[1]), torch.zeros(C), group.has_mean
     if means:
         A = torch.cat([torch.ones(n, 1), X], 1).double() * 2.0**-k  # inputs of a channel are the first ones
         square, right = A.T @ A, A.T @ (((base - middle) / deviation).double() * 2.0**-k)

@@ -43,6 +43,13 @@ class ChannelGroup:
     """Whether the anchor's class scales its steps. Then the class predicts the group too."""
     masked: int = 0
     """Channels of each slot, if those of masked slots are left out; 0: none are."""
+    refines: bool = False
+    """Whether coarse values of the same channels are known and predict it (`refine`)."""
+
+    @property
+    def has_mean(self) -> bool:
+        """Whether anything but the class predicts the mean."""
+        return self.from_parents or self.is_chain or self.refines
 
 
 def anchor_groups(F: int, K: int, has_slots: bool = False, extra: int = 0) -> tuple[ChannelGroup, ...]:
@@ -69,7 +76,8 @@ class GroupModel:
     numbers: Ints
     """[C, 4]: bias and shift of the mean, bias and shift of the spread."""
     scaling: Ints
-    """[C, 2]: factor and offset that make inputs of the values (`reference.as_inputs`)."""
+    """[C, 2]: factor and offset that make inputs of the values (`reference.as_inputs`); [0, 2] of a
+    group that refines, whose values become inputs as those of the group that it refines."""
 
     def checked(self) -> GroupModel:
         """This model. Raises Damaged for numbers that the sums could not bear."""
@@ -84,7 +92,7 @@ class GroupModel:
 def inputs_of(group: ChannelGroup, channels: Mapping[str, int]) -> list[int]:
     """How many inputs each channel of a group has. channels: of the groups by name."""
     fixed = LEVELS + (CLASSES if group.has_steps else 0) + sum(channels[name] for name in group.own)
-    fixed += group.channels if group.from_parents else 0
+    fixed += group.channels * (group.from_parents + group.refines)
     found = [fixed + (c if group.is_chain else 0) for c in range(group.channels)]
     if found and found[-1] > MOST_INPUTS:
         raise Damaged(f"{found[-1]:,} inputs of a model, more than {MOST_INPUTS:,}")

@@ -76,7 +76,7 @@ def _code_model(code: Coding, group: ChannelGroup, inputs: list[int], model: Gro
     known = [None] * 6 if model is None else [*model.numbers.T, *model.scaling.T]
     biases = [_code_coarse(code, known[i], C) for i in (0, 2)]
     shifts = [_differences(code, known[i], C, -24, 24) for i in (1, 3)]
-    scaling = [_code_coarse(code, known[i], C) for i in (4, 5)]
+    scaling = [_code_coarse(code, known[i], 0 if group.refines else C) for i in (4, 5)]
     numbers = np.stack([biases[0], shifts[0], biases[1], shifts[1]], 1)
     scales = None if model is None else np.array([[scale_of(row) for row in rows] for rows in model.weights], np.int32)
     scale = np.stack([_differences(code, None if scales is None else scales[:, i], C, 0, TOP) for i in (0, 1)], 1)

@@ -106,6 +106,14 @@ def scene_in(page: bytes) -> bytes:
         raise Damaged("a scene that is not base64") from None
 
 
+def settings_in(page: bytes) -> dict[str, Any]:
+    """The settings in a page. Raises CutShort for a page without them, ValueError for damaged ones."""
+    found = _settings(page)
+    if not found:
+        raise CutShort("no settings")
+    return found
+
+
 def unit_of(splats: Splats) -> float:
     """The factor by which the page multiplies lengths: 1 where SPZ holds every size and position,
     else the power of two that brings the median size to the middle of its range, without a position

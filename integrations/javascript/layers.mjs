@@ -1,0 +1,170 @@
+// Reads scenes of scene-experts in layers (docs/compact-file.md): a coarse scene, a plan, and chunks that make it whole.
+// Licence: Apache-2.0.
+//
+//   const scene = await LayeredScene.open(await readCompact(coarse), plan);   // plan, chunks: Uint8Array
+//   for (const chunk of chunks) scene.take(chunk);
+//   scene.scene();   // as readCompact returns it, with the anchors that are here; after all chunks the whole scene
+//
+// Throws an Error for files that it does not read, and where the checksum of all numbers differs.
+import {
+  CLASSES, LEVELS, LOW_CLASS, Reader, UNIT, bytesOf, clamp, compareMorton, crc32, fail, findParents, makeGroups, open, pick, readChannel, readModel,
+  readPlaces,
+} from "./compact.mjs";
+
+const ADDED = 0, COARSE = 1; // which of the inputs for levels is set
+const MOST_CHUNKS = 64, AXIS = 2 ** 21, LARGEST = 2 ** 30;
+
+// The groups that refine coarse anchors: the same channels, from coarse values of them.
+function refinedGroups(groups) {
+  const own = { feature: [], scaling: ["feature"], slots: ["feature"], offsets: ["feature", "scaling"] };
+  const channels = Object.fromEntries(groups.map((g) => [g.name, g.channels]));
+  return groups.filter((g) => own[g.name]).map((g) => {
+    const fixed = LEVELS + (g.steps ? CLASSES : 0) + own[g.name].reduce((sum, name) => sum + channels[name], 0) + g.channels;
+    const inputs = Array.from({ length: g.channels }, (_, c) => fixed + (g.chain ? c : 0));
+    return { ...g, own: own[g.name], parents: false, refines: true, inputs };
+  });
+}
+
+// The places of coarse and further anchors in one order along the curve; rows: their numbers, the coarse ones first.
+function merge(coarse, more, lattices) {
+  const levels = new Map([...lattices, ...coarse.header.lattices].map(([level, edge]) => [level, edge]));
+  const every = [...levels.entries()].sort((a, b) => a[0] - b[0]), finest = Math.min(...levels.values());
+  const number = new Map(every.map(([level], i) => [level, i])), n = coarse.header.N, N = n + more.lattice.length;
+  const own = new Float64Array(3 * N), lattice = new Uint8Array(N), wide = new Float64Array(3 * N), fine = new Int32Array(3 * N);
+  own.set(coarse.cells);
+  own.set(more.own, 3 * n);
+  for (let i = 0; i < N; ++i) {
+    const [level, edge] = i < n ? coarse.header.lattices[coarse.lattice[i]] : lattices[more.lattice[i - n]], multiple = Math.round(edge / finest);
+    lattice[i] = number.get(level);
+    for (let a = 0; a < 3; ++a) wide[3 * i + a] = own[3 * i + a] * multiple;
+  }
+  for (let a = 0; a < 3; ++a) {
+    let low = Infinity, high = -Infinity;
+    for (let i = a; i < 3 * N; i += 3) (low = Math.min(low, wide[i])), (high = Math.max(high, wide[i]));
+    if (high - low >= AXIS) fail("cells that are too far away");
+    for (let i = a; i < 3 * N; i += 3) fine[i] = wide[i] - low;
+  }
+  const rows = Int32Array.from({ length: N }, (_, i) => i).sort((i, j) => compareMorton(fine, i, j) || lattice[i] - lattice[j] || i - j);
+  return { rows, cells: pick(own, rows, Float64Array), fine: pick(fine, rows, Int32Array), lattice: Uint8Array.from(rows, (i) => lattice[i]), lattices: every };
+}
+
+export class LayeredScene {
+  // coarse: what readCompact returns; plan: the bytes that belong to it.
+  static async open(coarse, plan) {
+    const { header, parts } = await open(plan, "SXPLAN1\n", 1);
+    if (header.coarse !== coarse.checksum) fail("the plan of another scene");
+    return new LayeredScene(coarse, header, parts);
+  }
+
+  constructor(coarse, header, parts) {
+    const more = header.N - coarse.header.N, { chunks } = header, groups = makeGroups({ ...coarse.header, slots: header.slots });
+    const places = merge(coarse, readPlaces({ N: more, lattices: header.lattices }, new Reader(parts.positions)), header.lattices), { rows } = places;
+    if (!coarse.groups.slots || chunks.length > MOST_CHUNKS || [...chunks].sort((a, b) => a - b).some((v, i) => v !== i)) fail("another plan");
+    const isCoarse = Uint8Array.from(rows, (row) => (row < coarse.header.N ? 1 : 0)), numbers = Int32Array.from(rows.keys());
+    const parents = findParents(places.fine, numbers, isCoarse.map((v) => 1 - v)), stream = new Reader(parts.models), models = {};
+    const refined = refinedGroups(groups);
+    Object.assign(this, { coarse, header, places, isCoarse, parents, groups, refined, models, known: isCoarse.slice(), taken: 0, total: chunks.length });
+    for (const g of groups) models[g.name] = readModel(stream, g);
+    for (const g of refined) models[`${g.name}+`] = { ...readModel(stream, g), factor: models[g.name].factor, offset: models[g.name].offset };
+    stream.finish();
+    this.values = {};
+    this.columns = {};
+    for (const [name, channels] of Object.entries(coarse.groups)) {
+      const by = 2 ** (header.shifts[name] ?? 0);
+      this.values[name] = channels.map((from) => Int32Array.from(rows, (row, i) => (isCoarse[i] ? clamp(from[row] * by, -LARGEST, LARGEST) : 0)));
+    }
+    for (const g of groups) this.columns[g.name] = this.values[g.name].map((values, c) => this.inputsOf(g, c, values));
+  }
+
+  // The values [N] of a channel as inputs; 0 for anchors that are not coarse.
+  inputsOf(g, c, values) {
+    const { factor, offset } = this.models[g.name], classes = this.values.class[0], out = new Int16Array(values.length);
+    for (let i = 0; i < out.length; ++i) {
+      if (!this.isCoarse[i]) continue;
+      const fine = (g.steps ? classes[i] : 0) + 2, reach = Math.floor(2 ** 29 / factor[c]) >> fine;
+      out[i] = clamp((clamp(values[i], -reach, reach) * 2 ** fine * factor[c] - offset[c] + 2048) >> 12, -2047, 2047);
+    }
+    return out;
+  }
+
+  // The inputs [rows, width] of a group without those of its chain.
+  makeInputs(g, width, kind, rows) {
+    const inputs = new Int16Array(width * rows.length), classes = this.values.class[0], { found, weights } = this.parents;
+    let at = LEVELS;
+    const fill = (value) => {
+      for (let j = 0, to = at; j < rows.length; ++j, to += width) inputs[to] = value(rows[j]);
+      ++at;
+    };
+    for (let j = 0; j < rows.length; ++j) {
+      inputs[j * width + kind] = UNIT;
+      if (g.steps) inputs[j * width + LEVELS + classes[rows[j]] - LOW_CLASS] = UNIT;
+    }
+    if (g.steps) at += CLASSES;
+    for (const name of g.own) for (const column of this.columns[name]) fill((i) => column[i]);
+    for (const column of g.parents ? this.columns[g.name] : [])
+      fill((i) => {
+        const j = 4 * i, a = weights[j] * column[found[j]] + weights[j + 1] * column[found[j + 1]];
+        return (a + weights[j + 2] * column[found[j + 2]] + weights[j + 3] * column[found[j + 3]]) >> 8;
+      });
+    for (const column of g.refines ? this.columns[g.name] : []) fill((i) => column[i]);
+    return inputs;
+  }
+
+  // Reads the channels of a group at rows. live: by slot, whether values of a row are there; null: all are.
+  run(g, reader, kind, rows, live) {
+    const width = g.inputs[0] + (g.chain ? g.channels : 0), inputs = this.makeInputs(g, width, kind, rows), model = this.models[g.name + (g.refines ? "+" : "")];
+    const classes = Int32Array.from(rows, (i) => this.values.class[0][i]), kept = g.name !== "offsets";
+    for (let c = 0; c < g.channels; ++c) {
+      const to = this.values[g.name][c], column = this.columns[g.name][c], found = Int32Array.from(rows, (i) => to[i]), made = new Int16Array(rows.length);
+      readChannel(g, c, model, reader, inputs, width, 0, rows.length, classes, live?.[Math.floor(c / 3)], found, made, kept);
+      rows.forEach((i, j) => {
+        to[i] = found[j];
+        if (kept) column[i] = made[j];
+      });
+      if (g.name === "class" && found.some((v) => v < LOW_CLASS || v >= LOW_CLASS + CLASSES)) fail("a step class out of range");
+    }
+  }
+
+  // Takes the next chunk.
+  take(bytes) {
+    const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength), { N } = this.header;
+    if (this.taken >= this.total || bytes.length < 4 || crc32(bytes.subarray(0, -4)) !== view.getUint32(bytes.length - 4, true)) fail("bytes with another checksum");
+    const number = this.header.chunks[this.taken], reader = new Reader(bytes.subarray(0, -4)), rows = [[], []], { slots } = this.values;
+    for (let i = Math.floor((number * N) / this.total); i < Math.floor(((number + 1) * N) / this.total); ++i) rows[this.isCoarse[i]].push(i);
+    const [added, coarse] = rows, masks = (list) => slots.map((slot) => Uint8Array.from(list, (i) => slot[i])), isOpen = !this.header.slots;
+    const open = (list) => isOpen && slots.forEach((slot) => list.forEach((i) => (slot[i] = 1)));
+    if (coarse.length) {
+      const before = masks(coarse);
+      for (const g of this.refined) {
+        if (g.name === "offsets") open(coarse);
+        this.run(g, reader, COARSE, coarse, g.name === "offsets" ? masks(coarse).map((slot, k) => slot.map((v, j) => v & before[k][j])) : null);
+      }
+      this.run(this.groups.at(-1), reader, COARSE, coarse, masks(coarse).map((slot, k) => slot.map((v, j) => v & (1 - before[k][j]))));
+    }
+    for (const g of added.length ? this.groups : []) {
+      if (g.name === "offsets") open(added);
+      this.run(g, reader, ADDED, added, g.name === "offsets" ? masks(added) : null);
+    }
+    reader.finish();
+    for (const i of [...coarse, ...added]) this.known[i] = 1;
+    this.taken += 1;
+    if (this.taken === this.total && this.checksum() !== this.header.integers) fail("numbers with another checksum");
+  }
+
+  checksum() {
+    let sum = crc32(bytesOf(this.places.fine));
+    for (const g of this.groups) for (const channel of this.values[g.name]) sum = crc32(bytesOf(channel), sum);
+    for (const { values, exponents } of Object.values(this.coarse.networks)) sum = crc32(bytesOf(exponents), crc32(bytesOf(values), sum));
+    for (const { values } of Object.values(this.coarse.exact)) sum = crc32(bytesOf(values), sum);
+    return sum;
+  }
+
+  // The scene of the anchors that are here, as readCompact returns one.
+  scene() {
+    const { places, values, coarse } = this, rows = Int32Array.from(this.known.keys()).filter((i) => this.known[i]), groups = {};
+    const slots = this.header.slots || this.taken < this.total;
+    for (const [name, channels] of Object.entries(values)) if (name !== "slots" || slots) groups[name] = channels.map((channel) => Int32Array.from(rows, (i) => channel[i]));
+    const header = { ...coarse.header, N: rows.length, steps: this.header.steps, slots, lattices: places.lattices };
+    return { ...coarse, header, groups, cells: pick(places.cells, rows, Float64Array), lattice: Uint8Array.from(rows, (i) => places.lattice[i]) };
+  }
+}
