@@ -46,7 +46,7 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
     parts = _Parts(fingerprint)
     for number, path in enumerate(runs):  # one run in memory at a time
         parts.add(run_folder.open_run(path), path, blocks, number)
-    data = replace(parts.configs[0].data, views=None)
+    data = replace(parts.configs[0].data, views=None, near=_nearest(parts.configs))
     command = f"merged from {len(runs)} blocks"
     config = replace(parts.configs[0], data=data, command=command, versions=run_folder.versions(), stop_at=None, init_from=None)
     run_folder.prepare(out, config, resume=False)
@@ -133,6 +133,13 @@ def _check_box(blocks: Sequence[Block], number: int, run: OpenRun) -> None:
 
 def _is_same_box(bounds: Sequence[float], block: Block) -> bool:
     return all(math.isclose(a, b, rel_tol=1e-5) for a, b in zip(bounds, block.bounds))  # a plan writes six digits
+
+
+def _nearest(configs: Sequence[RunConfig]) -> float | None:
+    """Return the least near plane of the blocks: each has that of its own views (`--near-share`). None,
+    the default, if a block has it."""
+    planes = [config.data.near for config in configs]
+    return None if None in planes else min(near for near in planes if near is not None)
 
 
 def _lattice(scene: Scene) -> dict[str, Any]:

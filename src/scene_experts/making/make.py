@@ -82,7 +82,7 @@ def make(
         out: Folder to write. Default: the name of the source with "-scene", in this folder.
         minutes: Time for the whole, above 0. It decides iterations, resolution and effort; poses
             take what they take. Default: what `info` proposes.
-        scores: Hold out every 8th photograph and score it. Default: train on all of them.
+        scores: Hold out every 8th photograph of at least 12, and score it. Default: train on all.
         options: What the photographs or the video need: frames of a video, panoramas, matching.
         say: Called with each message.
         progress: Called with the name of the work, how much is done and how much there is.
@@ -200,7 +200,8 @@ class TrainingPlan:
 def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Callable[[str], None]) -> TrainingPlan:
     """Return what is trained: a run that has begun, or what fits the budget.
 
-    Raises InputError if the run in the folder was begun with other photographs held out.
+    Raises InputError if the run in the folder was begun with other photographs held out, or if
+    scores are asked for and there are too few photographs to hold any out.
     """
     split = "auto" if scores else "none"  # auto: lists beside the poses, such as those of panoramas, else every 8th
     if (folder / "config.json").is_file():
@@ -216,6 +217,11 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
         capture = load_capture(place, split=split, resolution=begun.data.resolution, seed=begun.train.seed)
         return TrainingPlan(place, split, (0, 0), capture, begun.train, begun=True)
     whole = load_capture(place, split=split)
+    if scores and not whole.test_cameras:
+        raise InputError(
+            f"expected photographs to hold out for --scores, found {len(whole.train_cameras)}, so few that all are trained on; "
+            "leave --scores out, the poses are kept"
+        )
     lens = whole.cameras[0]
     first = TrainingPlan(place, split, (lens.width, lens.height), whole, recipe(PROPOSED, exposure=drifts(place)))
     share = measure_share(torch.get_num_threads())

@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import time
+from collections import Counter
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -97,7 +98,7 @@ def reconstruct(
             )
         if warning := warn_of_mapper(result, options):
             say(warning)
-        exhaustive = len(pairs) == every_pair(names)
+        exhaustive = len(pairs) == every_pair([find_place(name) for name in names])
         note = describe_result(result, found, options, time.monotonic() - began, copied=not own, exhaustive=exhaustive)
         write_facts(Path(request["model"]), images, rig, result, note, folder / work.DONE / NOTE)
         work.publish(out)
@@ -144,14 +145,14 @@ def pairs_by_features(
     `names`."""
     run_worker({**request, "poses": False}, folder / LOG, say, progress)
     pairs, spare = find_alike(Path(request["database"]), names, [find_place(name) for name in names])
-    every = every_pair(names)
+    every = every_pair([find_place(name) for name in names])
     say(f"{len(pairs):,} of {every:,} pairs to match: photographs that look alike, and each with those that follow it")
     return pairs, spare
 
 
-def every_pair(names: list[str]) -> int:
-    """Return the number of pairs of photographs."""
-    return len(names) * (len(names) - 1) // 2
+def every_pair(places: list[str]) -> int:
+    """Return the number of pairs of photographs whose places (`find_place`) differ."""
+    return (len(places) ** 2 - sum(n * n for n in Counter(places).values())) // 2
 
 
 def describe_request(

@@ -36,6 +36,8 @@ def adjust_to_tracks(capture: Capture) -> AdjustedCapture:
     points, seen = tracks
     cameras = [capture.views[i].camera for i in capture.train]
     found = adjust(np.stack([camera.world_to_cam.double().numpy() for camera in cameras]), points, seen)
+    if not found.observations:
+        return AdjustedCapture(capture, "poses are refined by the photographs alone: no point is in the tracks of two training views")
     if not found.before - found.after > max(WORTH * found.before, LEAST):
         return AdjustedCapture(capture, f"the poses fit the capture's tracks: their median error is {found.before:.2f} px")
     moved = {camera.id: at_pose(camera, torch.from_numpy(pose)) for camera, pose in zip(cameras, found.poses)}

@@ -1,8 +1,7 @@
 """The near plane: how close to a camera Gaussians are drawn.
 
-No photograph shows anything nearer than the nearest of its points. What a training puts closer to
-its cameras all the same is fog, and stands before cameras that have no photograph
-(results/default.md).
+What a training puts much closer to its cameras than the nearest point that their photographs show is
+mostly fog, and stands before cameras that have no photograph (results/default.md).
 """
 
 from __future__ import annotations

@@ -176,3 +176,15 @@ def test_a_block_whose_training_has_not_ended_is_told(planned, tmp_path, caplog)
     caplog.clear()
     merge_blocks(plan, [plan / "run0", plan / "run1"], tmp_path / "merged")
     assert "ended at" not in caplog.text
+
+
+@pytest.mark.parametrize("planes, expected", [((0.5, 0.2), 0.2), ((0.5, None), None)])
+def test_the_merged_scene_has_the_least_near_plane(planned, tmp_path, planes, expected):
+    plan, _ = planned
+    for number, near in enumerate(planes):
+        place = plan / f"run{number}" / "config.json"
+        value = json.loads(place.read_text())
+        value["data"]["near"] = near
+        place.write_text(json.dumps(value))
+    merge_blocks(plan, [plan / "run0", plan / "run1"], tmp_path / "merged")
+    assert open_run(tmp_path / "merged").config.data.near == expected

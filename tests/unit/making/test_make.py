@@ -92,6 +92,14 @@ def test_scores_are_those_of_photographs_held_out(capture, tmp_path, trained):
     assert len(trained.made[0].capture.test_cameras) == 2 and made.psnr == 21.0 and made.report is not None
 
 
+def test_scores_of_too_few_photographs_are_refused_before_the_training(capture, tmp_path, trained, monkeypatch):
+    given = making.load_capture
+    monkeypatch.setattr(making, "load_capture", lambda place, split, **more: given(place, split="none", **more))
+    with pytest.raises(InputError, match=r"for --scores, found 9, so few that all are trained on; leave --scores out"):
+        make(capture, tmp_path / "out", scores=True, say=lambda _: None)
+    assert not trained.made and not (tmp_path / "out" / "run").exists()
+
+
 def test_a_training_that_would_not_fit_begins_anew_with_other_iterations(capture, tmp_path, trained):
     trained.Trainer.seconds = 0.1  # 1,000 iterations would take 170 s with growth
     make(capture, tmp_path / "out", minutes=1.5, say=lambda _: None)

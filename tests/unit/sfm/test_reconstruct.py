@@ -335,3 +335,8 @@ def test_poses_of_the_second_mapper_get_a_warning(tmp_path, monkeypatch, mapper,
     monkeypatch.setattr(run, "run_worker", fake_worker(**{**FOUND, "mapper": mapper, "lacking": []}))
     run.reconstruct(write_black(tmp_path / "photos"), tmp_path / "out", SfmOptions(mapper=asked), say=said.append)
     assert sum("warning" in line and "global mapper" in line for line in said) == warned
+
+
+def test_views_of_one_panorama_are_no_pair():
+    assert run.every_pair(["a", "b", "c"]) == 3
+    assert run.every_pair(["a", "a", "b"]) == 2

@@ -68,3 +68,11 @@ def test_a_training_begins_there_and_resumes_bit_for_bit(folder, tmp_path):
     tensors = last_tensors(tmp_path / "whole")
     assert_same(tensors, last_tensors(tmp_path / "parts"))
     assert tensors["poses.begun"].abs().max() > 1e-3
+
+
+def test_tracks_of_one_photograph_each_adjust_nothing(tmp_path):
+    folder = make_capture(tmp_path, views=10).folder
+    given = load(folder)
+    add_tracks(folder, unseen=tuple(given.views[i].name for i in given.train[1:]))
+    found = adjust_to_tracks(load(folder))
+    assert "no point is in the tracks of two" in found.about and "nan" not in found.about
