@@ -104,6 +104,8 @@ class _Parts:
             raise InputError(f"expected a run on the capture of the plan, found one on another in {path}; use the plan's command")
         if scene.poses is not None:
             raise InputError(f"expected blocks on the poses of the capture, found refined ones in {path}; train it without --refine-poses")
+        if scene.exposures is not None:
+            raise InputError(f"expected blocks without learned exposures, found a run with them in {path}; train it without --exposure")
         if not same_poses(self.poses, run.poses):
             raise InputError(f"expected runs on one capture, found other camera poses in {path} than in the first block; train it again")
 

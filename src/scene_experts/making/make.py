@@ -32,7 +32,7 @@ from scene_experts.making.budget import LOOK, PAGE_GUESS, SCORES_GUESS, TRAINING
 from scene_experts.sfm.drift import drifts
 from scene_experts.sfm.lacking import explain_lacking
 from scene_experts.sfm.options import SfmOptions, SourceOptions
-from scene_experts.sfm.reconstruct import NOTE, reconstruct
+from scene_experts.sfm.reconstruct import NOTE, check_request, reconstruct
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Event, Stepped
@@ -141,12 +141,27 @@ def find_poses(source: Path, folder: Path, options: SourceOptions, say: Callable
         expect_same(place, options)
         say(f"poses: those in {place}; after a change of the photographs, remove that folder and {folder / RUN}")
         return place
-    found = reconstruct(source, place, SfmOptions(**asdict(options)), say=say, progress=progress)
-    write_json(note, {"source": here})
+    check_request(source, place, overwrite=False)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(note, {"source": here})  # before the capture: a call that is killed between the two goes on
+    try:
+        found = reconstruct(source, place, SfmOptions(**asdict(options)), say=say, progress=progress)
+    except InputError:
+        forget_empty(folder, place, note)
+        raise
     say(f"poses: {found['with_pose']} of {found['photographs']} photographs, {found['points']:,} points")
     for line in explain_lacking(found, f"--matching exhaustive --out {folder}-2"):
         say(line)
     return place
+
+
+def forget_empty(folder: Path, place: Path, note: Path) -> None:
+    """Remove the folder of a call that could use nothing, unless something is in it."""
+    if place.is_dir() and not any(place.iterdir()):
+        place.rmdir()
+    if set(folder.iterdir()) == {note}:
+        note.unlink()
+        folder.rmdir()
 
 
 def list_changes(before: Any, options: SourceOptions) -> list[tuple[str, Any, Any]]:
@@ -206,16 +221,15 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
     split = "auto" if scores else "none"  # auto: lists beside the poses, such as those of panoramas, else every 8th
     if (folder / "config.json").is_file():
         begun = run_folder.read_config(folder)
-        if (begun.data.split == "none") is scores:
-            told = "none was" if begun.data.split == "none" else "some were"
+        capture = load_capture(place, split=begun.data.split, resolution=begun.data.resolution, seed=begun.train.seed)
+        if bool(capture.test_cameras) is not scores:
+            told = "some were" if capture.test_cameras else "none was"
             raise InputError(
                 f"expected a run with the same photographs held out in {folder}, found one where {told}; "
                 f"{'leave --scores out' if scores else 'add --scores'}, or choose another --out"
             )
         say(f"training: {describe_begun(folder, begun)}")
-        split = begun.data.split
-        capture = load_capture(place, split=split, resolution=begun.data.resolution, seed=begun.train.seed)
-        return TrainingPlan(place, split, (0, 0), capture, begun.train, begun=True)
+        return TrainingPlan(place, begun.data.split, (0, 0), capture, begun.train, begun=True)
     whole = load_capture(place, split=split)
     if scores and not whole.test_cameras:
         raise InputError(

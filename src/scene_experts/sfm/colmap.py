@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -26,7 +27,7 @@ def run_worker(request: dict[str, Any], log: Path, say: Say, progress: Progress)
     Raises InputError if pycolmap cannot be used, RunError if the worker fails.
     """
     environment = {**os.environ, "OMP_NUM_THREADS": str(request["threads"])}
-    with log.open("w") as stream:
+    with log.open("a") as stream:
         # -P: modules are not searched in the worker's folder. In a new session, because this
         # process handles Ctrl-C.
         process = subprocess.Popen(
@@ -53,6 +54,8 @@ def run_worker(request: dict[str, Any], log: Path, say: Say, progress: Progress)
         raise InputError(f"pycolmap cannot be imported ({last['why']}): {install_line('sfm')}")
     if code != 0 or last.get("step") != "done":
         check_space(log.parent)
+        if code == -signal.SIGKILL:
+            raise RunError("COLMAP was killed, most often because the memory is full; close other programs, or give a smaller --max-side")
         raise RunError(f"COLMAP failed with exit code {code}: {last_log_line(log)}; its log is {log}")
     return last
 

@@ -166,6 +166,18 @@ def test_runs_with_refined_poses_are_refused(planned, tmp_path, monkeypatch):
         merge_blocks(plan, [plan / "run0", plan / "run1"], tmp_path / "merged")
 
 
+def test_runs_with_learned_exposures_are_refused(planned, tmp_path, monkeypatch):
+    def learned(path):
+        run = open_run(path)
+        run.scene.exposures = object()
+        return run
+
+    plan, _ = planned
+    monkeypatch.setattr(run_folder, "open_run", learned)
+    with pytest.raises(InputError, match=r"without learned exposures.*; train it without --exposure"):
+        merge_blocks(plan, [plan / "run0", plan / "run1"], tmp_path / "merged")
+
+
 def test_a_block_whose_training_has_not_ended_is_told(planned, tmp_path, caplog):
     plan, second = planned
     config = plan / "run1/config.json"  # as after a signal: stopped, but not by --stop-at

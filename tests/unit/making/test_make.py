@@ -150,6 +150,42 @@ def test_photographs_get_poses_first(tmp_path, capture, trained, monkeypatch):
         make(tmp_path / "others", tmp_path / "out", say=lambda _: None)
 
 
+def test_a_call_that_can_use_nothing_leaves_no_folder_and_a_killed_one_goes_on(tmp_path, monkeypatch):
+    left = []
+
+    def reconstruct(source, out, options, say, progress):
+        assert (out.parent / making.SOURCE).is_file()  # a kill after the capture is complete leaves the note too
+        out.mkdir(exist_ok=True)
+        for name in left:
+            (out / name).touch()
+        raise InputError("no poses")
+
+    monkeypatch.setattr(making, "reconstruct", reconstruct)
+    (tmp_path / "photos").mkdir()
+    for kept in ([], ["colmap.log"]):
+        left[:] = kept
+        with pytest.raises(InputError, match="no poses"):
+            make(tmp_path / "photos", tmp_path / "out", say=lambda _: None)
+        assert (tmp_path / "out").exists() is bool(kept)
+    with pytest.raises(InputError, match=naming(tmp_path / "none")):
+        make(tmp_path / "none", tmp_path / "other", say=lambda _: None)
+    assert not (tmp_path / "other").exists()
+
+
+def test_what_counts_is_whether_photographs_are_held_out(tmp_path, capture, trained, monkeypatch):
+    """Not the word of the split: with auto, few photographs are all trained on."""
+    given = making.load_capture
+    monkeypatch.setattr(making, "load_capture", lambda place, split, **more: given(place, split="none", **more))
+    run = make(capture, tmp_path / "out", say=lambda _: None).run
+    (run / "config.json").touch()
+    begun = SimpleNamespace(data=SimpleNamespace(split="auto", resolution="auto"), train=trained.made[0].recipe)
+    monkeypatch.setattr(making.run_folder, "read_config", lambda folder: begun)
+    make(capture, tmp_path / "out", say=lambda _: None)
+    assert trained.made[1].resume
+    with pytest.raises(InputError, match="leave --scores out"):
+        make(capture, tmp_path / "out", scores=True, say=lambda _: None)
+
+
 def test_a_capture_has_its_poses(capture, tmp_path):
     with pytest.raises(InputError, match="--panoramas"):
         make(capture, tmp_path / "out", options=SourceOptions(panoramas="keep"))

@@ -11,6 +11,7 @@ from scene_experts.sfm import colmap
     [
         ("print('{\"step\": \"missing\", \"why\": \"no module\"}')", InputError, "no module"),
         ("import os; print('{\"step\": \"features\"}', flush=True); os.abort()", RunError, "-6"),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", RunError, "memory is full"),
         ("import sys; sys.exit('E20261122 10:00 1 sqlite.h:9] disk is full')", RunError, "disk is full"),
     ],
 )  # fmt: skip
