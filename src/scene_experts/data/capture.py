@@ -19,6 +19,7 @@ from scene_experts.data import prepare
 from scene_experts.data.blocks import read_view_names
 from scene_experts.data.colour import find_white
 from scene_experts.data.copies import tell_copies
+from scene_experts.data.depth_check import check_depths
 from scene_experts.data.depth_maps import DepthPhoto, find_points
 from scene_experts.data.equirectangular import find_place
 from scene_experts.data.images import FrameSource, check_policy, probe
@@ -76,7 +77,7 @@ def load(data: Data, seed: int = 0, *, allow_no_points: bool = False, cache_byte
             capture = _add_random_points(capture, seed, warn=data.init != "random")
         elif capture.points is None:
             capture = _check_no_points(capture, raw.points_source, allow_no_points)
-        capture = _finish(prepare.downscale(capture, policy))
+        capture = _finish(check_depths(prepare.downscale(capture, policy)))
     if data.views is not None:
         capture = choose_views(capture, data.views)
     if data.near is None:
@@ -203,7 +204,7 @@ def _assemble(root: Path, kind: str, raw: RawCapture, centred: bool, background:
         flat = to_pinhole(lens)
         K = torch.tensor([[flat.fx, 0, flat.cx], [0, flat.fy, flat.cy], [0, 0, 1]], dtype=torch.float64)
         camera = Camera(torch.from_numpy(image.world_to_cam), K, flat.width, flat.height, id=i)
-        views.append(View(image.name, camera, image.path))
+        views.append(View(image.name, camera, image.path, image.depth))
         sources.append(FrameSource(image.path, lens, (flat.width, flat.height), masks.masks.get(image.name), turn, raw.alpha_over, white))
     train, test = (tuple(i for i, image in enumerate(posed) if image.test == held) for held in (False, True))
     return Capture(

@@ -20,7 +20,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.reading.budget import MASK, PHOTOGRAPH
 from scene_experts.core.reading.pictures import opening_picture
 from scene_experts.core.types import Points
-from scene_experts.data.images import fits
+from scene_experts.data.images import Size, fits
 from scene_experts.data.lens import Lens
 
 MOST = 100_000  # points of a capture: as many as a reconstruction of many photographs has
@@ -70,23 +70,9 @@ def find_points(views: Sequence[DepthPhoto]) -> Points | None:
 
 def read_points(view: DepthPhoto, most: int) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.float64]]:
     """Return about `most` points [n, 3] of a depth map, their colours [n, 3] and depths [n]."""
-    depth = read_depth(view.depth)
+    depth = read_sure(view.depth, (view.lens.width, view.lens.height))
     height, width = depth.shape
-    if not fits((width, height), (view.lens.width, view.lens.height)):
-        raise InputError(
-            f"expected the depth map {view.depth.path} with the aspect ratio of its photograph ({view.lens.width}x{view.lens.height}), "
-            f"found {width}x{height}; export both as the camera took them"
-        )
-    sure = (depth > 0) & ~is_edge(depth)
-    if view.depth.confidence is not None:
-        confidence = read_values(view.depth.confidence)
-        if confidence.shape != depth.shape:
-            raise InputError(
-                f"expected {view.depth.confidence} with the {width}x{height} px of its depth map, "
-                f"found {confidence.shape[1]}x{confidence.shape[0]}; export both again"
-            )
-        sure &= confidence >= max(float(confidence.max()), 1.0)
-    rows, columns = np.nonzero(sure)
+    rows, columns = np.nonzero(depth)
     if not len(rows):
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0)
     step = max(1, len(rows) // most)
@@ -101,6 +87,32 @@ def read_points(view: DepthPhoto, most: int) -> tuple[NDArray[np.float64], NDArr
         colors = np.asarray(picture.convert("RGB").resize((width, height), Image.Resampling.BOX))
     places = local @ view.world_to_cam[:3, :3]
     return places.astype(np.float64), colors[rows, columns], z
+
+
+def read_sure(file: DepthFile, photograph: Size) -> NDArray[np.float64]:
+    """Read a depth map [H, W] in units of the capture; 0 where it knows nothing, is not sure, or
+    lies at an edge.
+
+    photograph: Width and height of its photograph, as stored. Raises InputError if a file is
+    damaged or does not fit.
+    """
+    depth = read_depth(file)
+    height, width = depth.shape
+    if not fits((width, height), photograph):
+        raise InputError(
+            f"expected the depth map {file.path} with the aspect ratio of its photograph ({photograph[0]}x{photograph[1]}), "
+            f"found {width}x{height}; export both as the camera took them"
+        )
+    sure = (depth > 0) & ~is_edge(depth)
+    if file.confidence is not None:
+        confidence = read_values(file.confidence)
+        if confidence.shape != depth.shape:
+            raise InputError(
+                f"expected {file.confidence} with the {width}x{height} px of its depth map, "
+                f"found {confidence.shape[1]}x{confidence.shape[0]}; export both again"
+            )
+        sure &= confidence >= max(float(confidence.max()), 1.0)
+    return np.where(sure, depth, 0.0)
 
 
 def read_depth(file: DepthFile) -> NDArray[np.float64]:

@@ -27,7 +27,7 @@ from scene_experts.data.lens import PANORAMA_VIEW, Lens, to_pinhole
 from scene_experts.data.masks import Mask, read_mask
 
 Size = tuple[int, int]  # width, height
-_ORIENTATION = 0x0112  # EXIF tag; 5 to 8 swap the axes
+ORIENTATION = 0x0112  # EXIF tag; 5 to 8 swap the axes
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def probe(path: Path) -> PhotoHeader:
     """Read the header of the image at `path`."""
     with opening_picture(path, PHOTOGRAPH) as image:
         size, mode = image.size, describe_mode(image)
-        orientation = image.getexif().get(_ORIENTATION, 1)  # PNG stores EXIF after the pixels: a truncated file fails here
+        orientation = image.getexif().get(ORIENTATION, 1)  # PNG stores EXIF after the pixels: a truncated file fails here
     return PhotoHeader(size, orientation if orientation in range(1, 9) else 1, mode)
 
 
@@ -196,7 +196,7 @@ def _load_mask(source: FrameSource) -> Image.Image | None:
         return None
     out = read_mask(source.mask)
     shaped = (out.width > out.height) == (source.lens.width > source.lens.height)
-    if source.turn and (not shaped or (out.getexif().get(_ORIENTATION, 1) in (2, 3, 4) or out.width == out.height)):
+    if source.turn and (not shaped or (out.getexif().get(ORIENTATION, 1) in (2, 3, 4) or out.width == out.height)):
         out = _turn_mask(source, out, shaped)
     if not fits(out.size, (source.lens.width, source.lens.height)):
         raise InputError(
@@ -215,9 +215,9 @@ def fits(size: Size, whole: Size) -> bool:
 
 def _turn_mask(source: FrameSource, out: Image.Image, shaped: bool) -> Image.Image:
     exif = out.getexif()
-    if exif.get(_ORIENTATION, 1) == 1 and not shaped:
+    if exif.get(ORIENTATION, 1) == 1 and not shaped:
         with opening_picture(source.path, PHOTOGRAPH) as photograph:
-            exif[_ORIENTATION] = photograph.getexif().get(_ORIENTATION, 1)
+            exif[ORIENTATION] = photograph.getexif().get(ORIENTATION, 1)
     return ImageOps.exif_transpose(out)
 
 

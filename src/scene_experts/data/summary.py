@@ -39,6 +39,7 @@ def summarise(capture: Capture) -> dict[str, Any]:
         "camera_models": dict(Counter(s.lens.model for s in sources).most_common()),
         "undistorted": sum(s.lens.distorted for s in sources),
         "masks": sum(s.mask is not None for s in sources),
+        "depth_maps": sum(v.depth is not None for v in capture.views),
         "points": 0 if points is None else len(points.xyz),
         "median_neighbour_distance": None if points is None else neighbour_distance(points.xyz),
         "extent": capture.extent,

@@ -13,6 +13,8 @@ from torch import Tensor
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera, Points
+from scene_experts.data.depth_maps import DepthFile
+from scene_experts.data.depth_views import read_map
 from scene_experts.data.store import ImageStore
 
 Vector = tuple[float, float, float]
@@ -31,6 +33,7 @@ class View:
     name: str  # relative path with extension, unique in the capture
     camera: Camera
     path: Path
+    depth: DepthFile | None = None  # its depth map
 
 
 @dataclass(frozen=True)
@@ -149,6 +152,15 @@ class Capture:
         """Return the pixels of view `index`. Raises InputError if its file cannot be read."""
         rgb, mask = self.images.get(index)
         return Frame(rgb, None if mask is None else mask.float() / 255)
+
+    def depth(self, index: int) -> Tensor | None:
+        """Return the depth map [h, w] of view `index` in trained units, 0 where it is not known;
+        None if the view has none. It shows what the view shows, at 512 pixels or less.
+
+        Raises InputError if its file cannot be read.
+        """
+        file = self.views[index].depth
+        return None if file is None else read_map(file, self.images.sources[index]).mul_(self.world.scale)
 
     def fingerprint(self) -> str:
         """Return a short hash of the names and sizes of the views and of the split.

@@ -83,11 +83,12 @@ def as_trained(rasterize: Rasterizer, antialias: bool) -> Rasterizer:
     return rasterize
 
 
-def for_training(rasterize: Rasterizer, absolute: bool) -> Rasterizer:
-    """Return the rasteriser without the depth, where it can leave it out, and whose `mean2d_grad`
-    holds sums of absolute values if `absolute`. Raises InputError if it has none."""
+def for_training(rasterize: Rasterizer, absolute: bool, depth: bool = False) -> Rasterizer:
+    """Return the rasteriser without the depth, unless the loss sees it and where it can leave it out, and
+    whose `mean2d_grad` holds sums of absolute values if `absolute`. Raises InputError if it has
+    none."""
     if hasattr(rasterize, "depth"):
-        rasterize = replace(rasterize, depth=False)  # type: ignore[type-var]
+        rasterize = replace(rasterize, depth=depth)  # type: ignore[type-var]
     if not absolute:
         return rasterize
     if not hasattr(rasterize, "absolute"):

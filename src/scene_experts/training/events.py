@@ -27,7 +27,7 @@ class Started:
     """Which implementation decodes the scene in the first iteration, and why not the fused one;
     empty without a choice."""
     start: str = ""
-    """Where the points that the scene starts from were computed: how many they are, and of what."""
+    """What the scene starts from: how many points were computed of what, and depth maps that count."""
     gradients: str = ""
     """On a GPU: whether training views are differentiated without autograd, and why not."""
 

@@ -33,7 +33,7 @@ from scene_experts.training.memory import anchor_cap, give_back, peak_bytes
 from scene_experts.training.resident import AHEAD, Resident
 from scene_experts.training.sensitivity import MOST_VIEWS, evenly, find_sensitivity
 from scene_experts.training.shards import Sharded, check_shard
-from scene_experts.training.start import begin
+from scene_experts.training.start import begin, uses_depth
 from scene_experts.training.state import Training, save
 from scene_experts.training.trial import fit_memory
 
@@ -60,7 +60,7 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
     """
     cfg = cfg.scaled()
     folder = run.out / "checkpoints" if run.out else None
-    rasterize = for_training(rasterize, cfg.growth.absolute)
+    rasterize = for_training(rasterize, cfg.growth.absolute, depth=uses_depth(cfg, capture))
     training = run.group.agree(lambda: _begin(cfg, run, capture, folder, rasterize))
     exchange = start_exchange(training, run)
     total = last_iteration(cfg, run)
@@ -240,7 +240,8 @@ def see_view(
     drawn = decoded.gaussians if pose is None else attach(decoded.gaussians, pose)
     render = rasterize(drawn, camera, photographs.background(color))
     render = replace(render, image=scene.as_photographed(render.image, camera))
-    parts = compute_terms(Sample(decoded, render, target, mask, number), cfg.loss)
+    depth = photographs.depth(index) if cfg.loss.depth else None
+    parts = compute_terms(Sample(decoded, render, target, mask, number, depth), cfg.loss)
     loss = torch.stack(list(parts.values())).sum()
     if loss.requires_grad:
         loss.backward()

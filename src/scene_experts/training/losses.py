@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from scene_experts.arguments.option import Option
 from scene_experts.core.fields import SCALES, Needs, NotNegative, Share
 from scene_experts.core.parts import Part, register
 from scene_experts.core.types import Decoded, Render, Routing
@@ -34,7 +35,11 @@ class Sample:
     target: Tensor  # [H, W, 3], the photograph
     mask: Tensor | None = None  # [H, W] in [0, 1]; pixels with 0 are ignored
     step: int | None = None  # the iteration, for terms that start or end; None: all terms are active
+    depth: Tensor | None = None  # [h, w] in world units, what is known of the view's depth; 0 where nothing is
 
+
+SOLID = 0.9  # opacity above which a pixel has a depth
+LARGEST_ERROR = 0.2  # relative, of a depth: a larger one is one of the map, or of something else that the map shows
 
 Term = Callable[["Weights", Sample], dict[str, Tensor]]
 """Function that maps weights and a sample to weighted terms by name, each []. Empty if the term is
@@ -67,6 +72,10 @@ class Weights(Part):
     """Weight of the mean opacity of all explicit Gaussians (3DGS-MCMC)."""
     mean_size: Annotated[NotNegative, Needs(EXPLICIT)] = 0.0
     """Weight of the mean size of all explicit Gaussians over the three axes (3DGS-MCMC)."""
+    depth: NotNegative = 0.0
+    """Weight of the error of the drawn depth, for captures with depth maps. It falls to a tenth."""
+    depth_until: Annotated[int, Option(hidden=True), SCALES] = 30_000
+    """Iteration at which the weight of the depth has fallen to a tenth."""
     opacity_from: Annotated[int, SCALES] = 0
     """First iteration with the opacity hinge."""
     opacity_until: Annotated[int | None, SCALES] = None
@@ -90,6 +99,10 @@ class Weights(Part):
         if self.residual_quantile < 1 and (step is None or step >= self.residual_from):
             return weigh_residuals(image, target, self.residual_quantile, self.residual_weight, mask)
         return mask
+
+    def weigh_depth(self, step: int | None) -> float:
+        """Return the weight of the depth at `step`; None is the first."""
+        return self.depth * 0.1 ** min(1.0, (step or 0) / max(self.depth_until, 1))
 
     @property
     def regularises(self) -> bool:
@@ -127,6 +140,13 @@ def photometric_terms(w: Weights, sample: Sample) -> dict[str, Tensor]:
     return ({"l1": l1} if w.dssim != 1 else {}) | ({"dssim": dssim} if w.dssim != 0 else {})
 
 
+def depth_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
+    """The error of the drawn depth, where the capture knows it."""
+    if w.depth == 0 or sample.depth is None:
+        return {}
+    return {"depth": w.weigh_depth(sample.step) * depth_error(sample.render.depth, sample.render.alpha, sample.depth, sample.mask)}
+
+
 def volume_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
     """The mean volume of the rendered Gaussians (Scaffold-GS)."""
     return {"volume": w.scale * volume(sample.decoded.gaussians.scales)} if w.scale != 0 else {}
@@ -161,10 +181,33 @@ def load_term(w: Weights, sample: Sample) -> dict[str, Tensor]:
 
 
 SCENE_TERMS: tuple[Term, ...] = (volume_term, hinge_term, mean_opacity_term, mean_size_term, load_term)
-Weights.terms = (photometric_terms, *SCENE_TERMS)
+Weights.terms = (photometric_terms, depth_term, *SCENE_TERMS)
 
 
 # --- functions that the terms use ---------------------------------------------------------------------------------------------------------
+
+
+def depth_error(drawn: Tensor, alpha: Tensor, known: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Mean over all pixels of the relative error of the depth, at most 0.2 each, [].
+
+    A pixel counts where its depth is known, its mask is above 0.5 and the scene is nearly opaque; the others have no
+    error. So a map that is wrong somewhere has little weight there, and the scene is not made
+    opaque or transparent.
+
+    Args:
+        drawn: [H, W] depth of a `Render`, which is not divided by alpha.
+        alpha: [H, W] opacity.
+        known: [h, w] depth of the same view at any size, 0 where it is not known.
+        mask: [H, W] in [0, 1] or None.
+    """
+    if known.shape != drawn.shape:
+        known = functional.interpolate(known[None, None], size=drawn.shape, mode="nearest")[0, 0]
+    alpha = alpha.detach()
+    counts = (known > 0) & (alpha > SOLID)
+    if mask is not None:
+        counts &= mask > 0.5
+    error = ((drawn / alpha.clamp_min(SOLID) - known).abs() / torch.where(counts, known, 1.0)).clamp(max=LARGEST_ERROR)
+    return torch.where(counts, error, 0.0).sum() / counts.numel()
 
 
 def volume(scales: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from scene_experts.core.transfer import upload
 from scene_experts.data.capture import Capture
 
 SHARE = 4  # of the memory that is free on a GPU when a training begins, photographs may take one part in so many
+DEPTHS = 1 << 29  # bytes of depth maps that stay on a CPU
 AHEAD = 3  # threads that decode photographs for a GPU, as the cores are free
 
 
@@ -30,6 +31,7 @@ class Resident:
         self.budget = budget if budget is not None else torch.cuda.mem_get_info(self.device)[0] // SHARE if gpu else 0
         self.used = 0
         self.kept: dict[int, tuple[Tensor, Tensor | None]] = {}
+        self.depths: dict[int, Tensor] = {}
         self.backgrounds: dict[tuple[float, ...], Tensor] = {}
 
     def see(self, index: int) -> tuple[Tensor, Tensor | None]:
@@ -46,6 +48,20 @@ class Resident:
         if self.device.type == "cuda" and self.dtype == torch.float32:
             return torch.div(rgb, 255.0), mask  # one kernel instead of two
         return rgb.to(self.dtype).div_(255.0), mask
+
+    def depth(self, index: int) -> Tensor | None:
+        """Return what is known of the depth of a photograph, [h, w] in world units with 0 where
+        nothing is, or None. Raises InputError if its file cannot be read."""
+        if index in self.depths:
+            return self.depths[index]
+        read = self.capture.depth(index)
+        if read is None:
+            return None
+        depth = upload(read, self.device, self.dtype)
+        size, room = depth.numel() * depth.element_size(), self.budget if self.device.type == "cuda" else DEPTHS
+        if self.used + size <= room:
+            self.depths[index], self.used = depth, self.used + size
+        return depth
 
     def background(self, color: Tensor | None) -> Tensor:
         """Return a background [3] on the device. None is that of the capture, and so is every

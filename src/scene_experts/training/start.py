@@ -47,8 +47,17 @@ def begin(cfg: Train, run: Job, capture: Capture, folder: Path | None) -> Traini
     if unused := find_unused(cfg):
         log.warning("these options have no effect with this recipe: %s; leave them out", ", ".join(unused))
     training.capture_id, training.poses, training.chosen = capture.fingerprint(), capture.poses(), capture.chosen()
+    if uses_depth(cfg, capture):
+        told = sum(capture.views[i].depth is not None for i in capture.train)
+        about = f"the depth maps of {told} of {len(capture.train)} training photographs count in the loss; --loss.depth 0 leaves them out"
+        training.computed = "; ".join(part for part in (training.computed, about) if part)
     training.scene.set_training_cameras([capture.views[i].camera for i in capture.train])
     return training
+
+
+def uses_depth(cfg: Train, capture: Capture) -> bool:
+    """Whether depth maps count in the loss."""
+    return cfg.loss.depth > 0 and any(capture.views[i].depth is not None for i in capture.train)
 
 
 def start(cfg: Train, data: Data, capture: Capture, device: str, dtype: torch.dtype) -> Training:

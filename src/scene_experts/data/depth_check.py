@@ -1,0 +1,68 @@
+"""Compares the depth maps of a capture with its points, which must have one unit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from scene_experts.core.types import Camera
+from scene_experts.data.views import Capture
+
+SAMPLED = 8  # views that are looked at
+BLOCK = 8  # px: of the points in one block, the nearest is compared, for the others may be hidden
+FEWEST = 20  # points of a view that say something
+AGREE = 1.1  # ratio of depths up to which maps and points have one unit
+
+
+def check_depths(capture: Capture) -> Capture:
+    """Return the capture without its depth maps, and with a note, where its points lie at other depths.
+
+    Maps that a network has guessed, or in another unit than the poses, would bend the scene in
+    silence. Raises InputError if a map is damaged.
+    """
+    having = [i for i, view in enumerate(capture.views) if view.depth is not None]
+    if not having or capture.points is None or capture.random_points:
+        return capture
+    chosen = sorted({having[round(k * (len(having) - 1) / max(SAMPLED - 1, 1))] for k in range(SAMPLED)})
+    ratios = [ratio for i in chosen if (ratio := find_ratio(capture, i)) is not None]
+    if not ratios or float(torch.tensor(ratios).log().abs().median()) <= math.log(AGREE):
+        return capture
+    middle, spread = float(torch.tensor(ratios).median()), max(ratios) / min(ratios)
+    each = "" if spread <= AGREE else f" ({min(ratios):.3g} to {max(ratios):.3g} times in single views)"
+    note = (
+        f"the {len(having)} depth maps are left out: the points lie at {middle:.3g} times their depth{each}; "
+        f"give maps in thousandths of the unit of the poses"
+    )
+    views = tuple(replace(view, depth=None) for view in capture.views)
+    return replace(capture, views=views, warnings=(*capture.warnings, note))
+
+
+def find_ratio(capture: Capture, index: int) -> float | None:
+    """Return the median ratio of the depth of points to that of the map of view `index`; None where
+    too few points say something."""
+    assert capture.points is not None
+    depth = capture.depth(index)
+    assert depth is not None
+    columns, rows, z = project(capture.points.xyz, capture.views[index].camera, (depth.shape[1], depth.shape[0]))
+    across = depth.shape[1] // BLOCK + 1
+    order = z.argsort()
+    blocks = ((rows // BLOCK) * across + columns // BLOCK)[order]
+    first = torch.full((across * (depth.shape[0] // BLOCK + 1),), len(z)).scatter_reduce(0, blocks, torch.arange(len(z)), "amin")
+    nearest = order[first[first < len(z)]]
+    there = depth[rows[nearest], columns[nearest]].double()
+    known = there > 0
+    return float((z[nearest][known] / there[known]).median()) if int(known.sum()) >= FEWEST else None
+
+
+def project(xyz: Tensor, camera: Camera, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the columns, rows and depths [n] of those points that a camera sees, in a picture of
+    `size` of all that it shows."""
+    pose = camera.world_to_cam.double()
+    x, y, z = (xyz.double() @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
+    columns = ((x / z * camera.fx + camera.cx) * (size[0] / camera.width)).floor()
+    rows = ((y / z * camera.fy + camera.cy) * (size[1] / camera.height)).floor()
+    seen = (z > camera.near) & (columns >= 0) & (columns < size[0]) & (rows >= 0) & (rows < size[1])
+    return columns[seen].long(), rows[seen].long(), z[seen]

@@ -1,0 +1,47 @@
+"""Depth maps as training sees them: turned, undistorted and resized like their photographs."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from PIL import Image, ImageOps
+from torch import Tensor
+
+from scene_experts.core.reading.budget import PHOTOGRAPH
+from scene_experts.core.reading.pictures import opening_picture
+from scene_experts.data.depth_maps import DepthFile, read_sure
+from scene_experts.data.images import ORIENTATION, FrameSource, Size, target_size
+from scene_experts.data.lens import Lens, to_pinhole
+
+LONGEST = 512  # px of the longer side: more than the map of a phone has
+
+
+def read_map(file: DepthFile, source: FrameSource) -> Tensor:
+    """Return a depth map [h, w] float32 in units of the capture; 0 where it is not known. It has
+    the shape of the frame of `source`, with a longer side of at most 512 px.
+
+    Raises InputError if a file is damaged or does not fit its photograph.
+    """
+    lens = source.lens
+    with opening_picture(source.path, PHOTOGRAPH) as photograph:
+        turn = photograph.getexif().get(ORIENTATION, 1) if source.turn else 1
+    values = read_sure(file, (lens.height, lens.width) if turn in (5, 6, 7, 8) else (lens.width, lens.height))
+    picture = Image.fromarray(values.astype(np.float32))
+    picture.getexif()[ORIENTATION] = turn
+    depth = torch.from_numpy(np.array(ImageOps.exif_transpose(picture)))
+    places = find_places(lens, target_size(f"longest:{LONGEST}", source.size))
+    planes = torch.stack((depth, (depth > 0).float()))
+    seen, known = torch.nn.functional.grid_sample(planes[None], places[None], padding_mode="zeros", align_corners=False)[0]
+    return torch.where(known > 0.999, seen / known.clamp_min(0.5), 0.0)  # beside what is not known, nothing is
+
+
+def find_places(lens: Lens, size: Size) -> Tensor:
+    """Return where the pixels of an undistorted picture of `size` lie in the photograph, [h, w, 2]
+    float32 in [-1, 1], for grid_sample; 2 where the photograph does not show them."""
+    flat = to_pinhole(lens).resize(*size)
+    rays = np.meshgrid((np.arange(size[0]) + 0.5 - flat.cx) / flat.fx, (np.arange(size[1]) + 0.5 - flat.cy) / flat.fy)
+    u, v = lens.distort(*rays) if lens.distorted else rays
+    places = np.stack(((u * lens.fx + lens.cx) * 2 / lens.width - 1, (v * lens.fy + lens.cy) * 2 / lens.height - 1), 2)
+    if lens.distorted:
+        places[lens.is_folded(*rays)] = 2
+    return torch.from_numpy(places.astype(np.float32))
