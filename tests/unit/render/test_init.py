@@ -1,6 +1,6 @@
 """The choice of a rasteriser: `auto`, and rasterisers that cannot be used."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import pytest
@@ -80,9 +80,18 @@ def test_a_rasteriser_is_as_the_run_was_trained():
     assert as_trained(plain, True) is plain  # type: ignore[arg-type]
 
 
+@dataclass(frozen=True)
+class SimpleDepth:
+    """A rasteriser that can leave out the depth."""
+
+    depth: bool = True
+
+
 def test_growth_asks_for_absolute_gradients():
     draw = choose("reference", "cpu")
     assert for_training(draw, False) is draw and for_training(draw, True) == replace(draw, absolute=True)  # type: ignore[type-var]
+    drawn = for_training(SimpleDepth(), False)
+    assert not drawn.depth and for_training(drawn, False, depth=True).depth
     with pytest.raises(InputError, match=r"--growth\.gradient"):
         for_training(SimpleNamespace(name="mine"), True)  # type: ignore[arg-type]
 

@@ -8,7 +8,7 @@ import torch
 
 from scene_experts.core.parts import register
 from scene_experts.core.types import Decoded, Gaussians, Render, Routing
-from scene_experts.training.losses import Sample, Weights, compute_terms, load_dense, load_sparse, opacity_hinge, volume
+from scene_experts.training.losses import Sample, Weights, compute_terms, depth_error, load_dense, load_sparse, opacity_hinge, volume
 from scene_experts.training.photometric import ssim
 
 
@@ -156,3 +156,31 @@ def test_a_term_comes_from_outside():
     assert list(found) == ["l1", "dssim", "volume", "smooth"]
     assert float(found["smooth"]) == pytest.approx(0.5 * float(render.image.diff(dim=1).abs().mean()))
     assert list(terms(decoded, render, target, SmoothWeights(smooth=0.0))) == list(terms(decoded, render, target, Weights()))
+
+
+def test_the_error_of_the_depth_is_relative_bounded_and_of_solid_known_pixels():
+    drawn = torch.tensor([[1.1, 1.9, 6.0], [3.0, 4.0, 5.0]], dtype=torch.float64, requires_grad=True)
+    alpha = torch.tensor([[1.0, 0.95, 1.0], [0.5, 1.0, 1.0]], dtype=torch.float64, requires_grad=True)
+    known = torch.tensor([[1.0, 2.0, 3.0], [3.0, 0.0, 4.0]], dtype=torch.float64)  # far off, not solid, not known, masked
+    mask = torch.tensor([[1.0, 1, 1], [1, 1, 0]], dtype=torch.float64)
+    error = depth_error(drawn, alpha, known, mask)
+    error.backward()
+    assert error.item() == pytest.approx((0.1 + 0.0 + 0.2) / 6, abs=1e-12) and alpha.grad is None
+    assert drawn.grad.flatten().tolist() == pytest.approx([1 / 6, 0, 0, 0, 0, 0]), "what is off by less than a fifth pulls"
+    assert depth_error(drawn, alpha, known).item() == pytest.approx((0.1 + 0.2 + 0.2) / 6, abs=1e-12)
+    enlarged = depth_error(drawn[:, :2], alpha[:, :2], known[:1, :1])  # a map with fewer pixels
+    assert enlarged.item() == pytest.approx((0.1 + 0.2 + 0.2) / 4)
+    x = torch.rand(3, 4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: depth_error(1 + 0.1 * x, torch.ones(3, 4).double(), torch.full((3, 4), 1.2).double()), x)
+
+
+def test_the_weight_of_the_depth_falls_to_a_tenth():
+    weights = Weights(depth=0.2, depth_until=100)
+    found = [weights.weigh_depth(step) for step in (None, 0, 50, 100, 500)]
+    assert found == pytest.approx([0.2, 0.2, 0.2 * 0.1**0.5, 0.02, 0.02])
+    x, y = pictures(4, 5)
+    render = Render(x, torch.ones(4, 5).double(), torch.full((4, 5), 2.2).double(), torch.zeros(0), torch.zeros(0, 2))
+    sample = Sample(None, render, y, step=100, depth=torch.full((4, 5), 2.0).double())
+    by_hand = {w: weights.terms[1](replace(weights, depth=w), sample) for w in (0.0, 0.2)}
+    assert by_hand[0.0] == {} and float(by_hand[0.2]["depth"]) == pytest.approx(0.02 * 0.1)
+    assert weights.terms[1](weights, replace(sample, depth=None)) == {}

@@ -5,6 +5,7 @@ import torch
 
 from scene_experts.training.resident import Resident
 from support.captures import load
+from support.depths import make_depths
 from support.synthetic import make_blender, make_capture
 
 
@@ -47,3 +48,16 @@ def test_transparent_photographs_keep_the_colour_that_they_lie_over(tmp_path) ->
     capture = load(make_blender(tmp_path).folder, init="random")
     assert capture.alpha_over == capture.background == (1.0, 1.0, 1.0)
     assert torch.equal(Resident(capture, "cpu", torch.float32).background(torch.zeros(3)), torch.ones(3))
+
+
+def test_depth_maps_stay_while_there_is_room(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = load(make_depths(tmp_path / "planes"))
+    some = Resident(capture, "cpu", torch.float64)
+    monkeypatch.setattr("scene_experts.training.resident.DEPTHS", 64 * 48 * 8)
+    one = some.depth(1)
+    assert one is some.depth(1) and one.dtype == torch.float64 and torch.equal(one, capture.depth(1).double())
+    assert some.depth(2) is not some.depth(2) and set(some.depths) == {1}
+
+
+def test_photographs_without_depth_have_none(capture) -> None:
+    assert Resident(capture, "cpu", torch.float32).depth(0) is None

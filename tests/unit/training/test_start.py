@@ -4,10 +4,17 @@ import re
 from dataclasses import replace
 
 import pytest
+import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.types import Mode
 from scene_experts.native import library as native
-from scene_experts.training.events import Finished
+from scene_experts.render import choose
+from scene_experts.training.events import Finished, Stepped
+from scene_experts.training.losses import Weights, depth_error
+from scene_experts.training.state import resume
+from support.captures import load
+from support.depths import make_depths
 from support.lanes import slow_except
 from support.planes import hole, make_planes, plane
 from support.trainings import assert_same, config, events, last_tensors
@@ -44,3 +51,33 @@ def test_a_recipe_starts_densely_with_few_views_and_few_points_and_says_so(tmp_p
     assert "finds no denser ones: it needs photographs that show depth and found it in 0.0 % of their pixels" in without.start
     with pytest.raises(InputError, match="--init dense"):
         next(events(cfg, flat, stop_at=1, init="dense"))
+
+
+def test_depth_maps_count_are_told_and_resume_bit_for_bit(tmp_path):
+    cfg, folder = config("scaffold-gs", loss=Weights(scale=0.01, depth=0.2)), make_depths(tmp_path / "planes")
+    begun, *rest, _ = events(cfg, folder, tmp_path / "whole", stop_at=12)
+    assert begun.start == "the depth maps of 4 of 4 training photographs count in the loss; --loss.depth 0 leaves them out"
+    shown = [event.terms for event in rest if isinstance(event, Stepped)]
+    assert shown and all(0 < terms["depth"] < 0.2 * 0.2 for terms in shown)
+    list(events(cfg, folder, tmp_path / "parts", stop_at=5))
+    list(events(cfg, folder, tmp_path / "parts", stop_at=12, resume=True))
+    assert_same(last_tensors(tmp_path / "whole"), last_tensors(tmp_path / "parts"))
+    off, *rest, _ = events(replace(cfg, loss=Weights(scale=0.01)), folder, stop_at=10)
+    assert off.start == "" and all("depth" not in event.terms for event in rest if isinstance(event, Stepped))
+    none, *rest, _ = events(cfg, make_planes(tmp_path / "none", plane(4.0)), stop_at=10)
+    assert none.start == "" and all("depth" not in event.terms for event in rest if isinstance(event, Stepped))
+
+
+def test_the_loss_of_depth_moves_the_scene_to_the_depth_of_the_maps(tmp_path):
+    folder, found = make_depths(tmp_path / "planes"), []
+    for weight in (0.0, 2.0):
+        cfg = config("scaffold-gs", loss=Weights(scale=0.01, depth=weight))
+        run = tmp_path / str(weight)
+        list(events(cfg, folder, run, stop_at=150))
+        training = resume(cfg.scaled(), run / "checkpoints", "cpu")
+        capture = load(folder)
+        camera = capture.views[2].camera
+        draw = choose("auto", "cpu")
+        drawn = draw(training.scene(camera, 150, Mode.DRAW, draw.visible).gaussians, camera, torch.zeros(3))
+        found.append(float(depth_error(drawn.depth, drawn.alpha, capture.depth(2))))
+    assert found[1] < 0.7 * found[0]
