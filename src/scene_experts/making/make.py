@@ -28,7 +28,7 @@ from scene_experts.core.signals import handled
 from scene_experts.data.readers import is_capture
 from scene_experts.files.export import export_several
 from scene_experts.files.options import Options
-from scene_experts.making.budget import LOOK, PAGE_GUESS, SCORES_GUESS, TRAINING, TimeBudget, Whole, find_slowness, plan_training
+from scene_experts.making.budget import LEAST, LOOK, PAGE_GUESS, SCORES_GUESS, TRAINING, TimeBudget, Whole, find_slowness, plan_training
 from scene_experts.sfm.drift import drifts
 from scene_experts.sfm.lacking import explain_lacking
 from scene_experts.sfm.options import SfmOptions, SourceOptions
@@ -243,7 +243,8 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
     held = f", {len(whole.test_cameras)} held out" if scores else ""
     about = f", {told}" if plan.advice and (told := plan.advice.tell(share)) else ""
     learned = ", their exposures" if plan.recipe.exposure else ""
-    what = f"{plan.recipe.iterations:,} iterations, {plan.capture.data.resolution}, {len(whole.train_cameras)} photographs{learned}"
+    least = " (the fewest; the time is too short for more)" if plan.recipe.iterations == LEAST else ""
+    what = f"{plan.recipe.iterations:,} iterations{least}, {plan.capture.data.resolution}, {len(whole.train_cameras)} photographs{learned}"
     say(f"training: {plan.recipe.recipe}, {what}{held}{about}")
     return plan
 

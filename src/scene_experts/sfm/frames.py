@@ -83,7 +83,8 @@ def read_frames(video: Path, filters: str, pixels: str, channels: int) -> tuple[
             yield from frames
         except (OSError, RuntimeError, ValueError) as error:
             why = str(error).strip().splitlines()[-1] if str(error).strip() else type(error).__name__
-            raise InputError(f"cannot decode the video {video}: {why}; convert it to mp4") from error
+            way = "give a video or a folder of photographs, or convert it to mp4"
+            raise InputError(f"cannot decode {video} as a video: {why}; {way}") from error
 
     stream = guarded()
     facts = next(stream)

@@ -92,6 +92,13 @@ def test_scores_are_those_of_photographs_held_out(capture, tmp_path, trained):
     assert len(trained.made[0].capture.test_cameras) == 2 and made.psnr == 21.0 and made.report is not None
 
 
+def test_the_fewest_iterations_are_told(capture, tmp_path, trained, monkeypatch):
+    monkeypatch.setattr(making, "plan_training", lambda *_: Advice(0, making.LEAST, 1.0))
+    said = []
+    make(capture, tmp_path / "out", minutes=1.0, say=said.append)
+    assert any("300 iterations (the fewest; the time is too short for more), " in line for line in said)
+
+
 def test_scores_of_too_few_photographs_are_refused_before_the_training(capture, tmp_path, trained, monkeypatch):
     given = making.load_capture
     monkeypatch.setattr(making, "load_capture", lambda place, split, **more: given(place, split="none", **more))

@@ -52,5 +52,5 @@ def test_more_frames_than_an_expression_of_ffmpeg_may_be_deep(tmp_path):
 def test_a_file_that_is_not_a_video_is_reported(tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     (tmp_path / "broken.mp4").write_bytes(b"nothing of the kind")
-    with pytest.raises(InputError, match=r"broken\.mp4"):
+    with pytest.raises(InputError, match=r"broken\.mp4 as a video: .*; give a video or a folder of photographs"):
         frames.extract_frames(tmp_path / "broken.mp4", tmp_path / "out", 3, lambda *_: None)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from itertools import islice
 from typing import cast
 
 import torch
@@ -54,8 +55,11 @@ class Judge:
     @cached_property
     def views(self) -> list[int]:
         """The training views that judge."""
-        views = [i for i in self.capture.train if not self.has_photographs or _shows(self.capture, i)]
-        return evenly(views, VIEWS)
+        chosen = evenly(self.capture.train, VIEWS)
+        if not self.has_photographs:
+            return chosen
+        shown = (i for i in self.capture.train if _shows(self.capture, i))
+        return [i for i in chosen if _shows(self.capture, i)] or list(islice(shown, 1))
 
     @property
     def has_photographs(self) -> bool:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -64,6 +65,20 @@ def test_a_file_without_photographs_gets_a_wanted_loss_or_size(tmp_path, monkeyp
     assert written.bytes <= wanted * 1e6 and written.bytes > 0.9 * wanted * 1e6
     with pytest.raises(InputError, match="--target-mb"):
         export(opened, "compact", tmp_path / "c.compact", Options(measure=False, target_mb=0.0001))
+
+
+def test_views_that_judge_are_not_those_without_a_pixel_that_counts(monkeypatch):
+    masks, looked = {2: torch.zeros(2, 2), 4: torch.ones(2, 2)}, []
+
+    def frame(index):
+        looked.append(index)
+        return SimpleNamespace(mask=masks.get(index))
+
+    capture = SimpleNamespace(train=tuple(range(8)), images=range(8), frame=frame)
+    monkeypatch.setattr(quality, "VIEWS", 4)
+    assert quality.Judge(None, None, capture, None).views == [0, 4, 6] and looked == [0, 2, 4, 6]
+    masks.update({i: torch.zeros(2, 2) for i in (0, 2, 4, 6)})
+    assert quality.Judge(None, None, capture, None).views == [1]
 
 
 def test_a_file_of_a_trained_rate_loses_nothing_at_rounding():
