@@ -15,7 +15,7 @@ from torch import Tensor
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
 from scene_experts.data.blocks import Block, read_plan
-from scene_experts.data.views import same_poses
+from scene_experts.data.views import Vector, same_poses
 from scene_experts.files.scene_folder import write_result_folder
 from scene_experts.scene import Scene
 from scene_experts.scene.anchors.quantise import CLASS
@@ -46,7 +46,7 @@ def merge_blocks(plan: Path, runs: Sequence[Path], out: Path) -> int:
     parts = _Parts(fingerprint)
     for number, path in enumerate(runs):  # one run in memory at a time
         parts.add(run_folder.open_run(path), path, blocks, number)
-    data = replace(parts.configs[0].data, views=None, near=_nearest(parts.configs))
+    data = replace(parts.configs[0].data, views=None, near=_nearest(parts.configs), background=_behind(parts.configs))
     command = f"merged from {len(runs)} blocks"
     config = replace(parts.configs[0], data=data, command=command, versions=run_folder.versions(), stop_at=None, init_from=None)
     run_folder.prepare(out, config, resume=False)
@@ -142,6 +142,17 @@ def _nearest(configs: Sequence[RunConfig]) -> float | None:
     the default, if a block has it."""
     planes = [config.data.near for config in configs]
     return None if None in planes else min(near for near in planes if near is not None)
+
+
+def _behind(configs: Sequence[RunConfig]) -> Vector | None:
+    """Return the background: the mean of those of the blocks, where each has the mean colour of its own
+    views (`--mean-background`), else that of the first."""
+    colours = [config.data.background for config in configs if config.train.mean_background]
+    known = [colour for colour in colours if colour is not None]
+    if len(known) < len(configs):
+        return configs[0].data.background
+    red, green, blue = (round(sum(channel) / len(known), 3) for channel in zip(*known))
+    return red, green, blue
 
 
 def _lattice(scene: Scene) -> dict[str, Any]:

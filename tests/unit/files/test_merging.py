@@ -200,3 +200,15 @@ def test_the_merged_scene_has_the_least_near_plane(planned, tmp_path, planes, ex
         place.write_text(json.dumps(value))
     merge_blocks(plan, [plan / "run0", plan / "run1"], tmp_path / "merged")
     assert open_run(tmp_path / "merged").config.data.near == expected
+
+
+@pytest.mark.parametrize("mean, expected", [((True, True), (0.3, 0.2, 0.15)), ((True, False), (0.2, 0.2, 0.2))])
+def test_the_merged_scene_has_the_mean_of_mean_backgrounds(planned, tmp_path, mean, expected):
+    plan, _ = planned
+    for number, (colour, asked) in enumerate(zip(((0.2, 0.2, 0.2), (0.4, 0.2, 0.1)), mean)):
+        place = plan / f"run{number}" / "config.json"
+        value = json.loads(place.read_text())
+        value["data"]["background"], value["train"]["mean_background"] = colour, asked
+        place.write_text(json.dumps(value))
+    merge_blocks(plan, [plan / "run0", plan / "run1"], tmp_path / "merged")
+    assert open_run(tmp_path / "merged").config.data.background == expected
