@@ -120,6 +120,10 @@ def hold_out(capture: Capture, split: str) -> Capture:
         test = tuple(indices[: int(first)])
     else:
         raise InputError(f"expected --split mod8 (or another modN), fold:K/N, first:N, none or files, found {split!r}; choose one")
+    if fold is not None and not test:
+        raise InputError(
+            f"expected a fold that holds out a view for --split {split}, found {len(capture.views)} views; use at most so many folds"
+        )
     held = set(test)
     train = tuple(i for i in indices if i not in held)
     if not train:
