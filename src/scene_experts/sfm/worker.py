@@ -22,6 +22,7 @@ CHUNK = 8  # photographs per progress message during feature extraction
 PAIRS = 200  # pairs per progress message during matching
 ENOUGH = 0.9  # fraction of photographs with a pose at which the second mapper is not tried
 FEW_FITTING = 4  # other photographs that fit one
+GROWN = 1.3  # times as many photographs or points as at the last adjustment of all poses, from which on they are adjusted anew
 FEW_FEATURES = 200  # a sharp photograph has thousands
 
 
@@ -285,6 +286,7 @@ def map_incrementally(colmap: Any, ask: dict[str, Any], out: str, total: int) ->
     options, count, attempt = colmap.IncrementalPipelineOptions(), 2, 0
     options.num_threads, options.random_seed, options.ba_use_gpu = ask["threads"], ask["seed"], False
     options.min_model_size = 3
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = GROWN
     if ask["rig"] is not None:
         options.ba_refine_sensor_from_rig = False
         options.constant_cameras = find_cut_cameras(colmap, ask)

@@ -82,6 +82,7 @@ def _for_photographs(name: str) -> Train:
     return replace(
         plain,
         scene=replace(plain.scene, few_fall=AFTER_GROWTH),
+        loss=replace(plain.loss, depth=0.2),
         dense_views=FEW,
         mean_background=True,
         near_share=0.5,
