@@ -42,6 +42,7 @@ POINTS = 30  # the most points of a training curve
 FILE = "file of records"
 PARTS = ("key", "recipe", "seed", "config", "results", "per_view", "curves", "fit", "sha256")
 """What each run of a file has."""
+MOST_EXPERTS = 16  # whose shares are kept: of more, they would be most of the file
 CURVES = {"step": 0, "seconds": 1, "psnr": 3, "anchors": 0, "scene_routing": 3}
 """Columns of a curve, and their decimals."""
 MEANS = ("psnr", "ssim", "lpips", "lpips_3dgs")
@@ -152,9 +153,10 @@ def fit_of(lines: Sequence[dict[str, Any]], iterations: int) -> float | None:
 
 def thin(lines: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return up to POINTS of the lines, with the decimals of CURVES. Every second one has the
-    shares of the experts."""
+    shares of the experts, of at most MOST_EXPERTS."""
     found = [{name: rounded(value, CURVES[name]) for name, value in line.items()} for line in spread(lines, POINTS)]
-    return [{**line, "scene_routing": {}} if i % 2 and "scene_routing" in line else line for i, line in enumerate(found)]
+    many = any(len(shares) > MOST_EXPERTS for line in found for shares in line.get("scene_routing", {}).values())
+    return [{**line, "scene_routing": {}} if (many or i % 2) and "scene_routing" in line else line for i, line in enumerate(found)]
 
 
 def spread(lines: Sequence[Any], most: int) -> list[Any]:

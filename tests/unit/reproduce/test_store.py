@@ -296,3 +296,9 @@ def test_a_whole_number_is_the_number_that_a_record_gives_back(tmp_path):
     whole = replace(made, config=replace(made.config, train=replace(made.config.train, loss=replace(made.config.train.loss, opacity=2))))
     (back,) = read(write(tmp_path, whole))
     assert back.key == whole.key and isinstance(back.config.train.loss.opacity, float)
+
+
+def test_curves_leave_out_the_shares_of_many_experts():
+    for experts, kept in ((store.MOST_EXPERTS, True), (store.MOST_EXPERTS + 1, False)):
+        line = {"step": 10, "psnr": 20.0, "scene_routing": {"color": [1 / experts] * experts}}
+        assert bool(store.thin([line, line])[0]["scene_routing"]) is kept

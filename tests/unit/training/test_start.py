@@ -79,5 +79,5 @@ def test_the_loss_of_depth_moves_the_scene_to_the_depth_of_the_maps(tmp_path):
         camera = capture.views[2].camera
         draw = choose("auto", "cpu")
         drawn = draw(training.scene(camera, 150, Mode.DRAW, draw.visible).gaussians, camera, torch.zeros(3))
-        found.append(float(depth_error(drawn.depth, drawn.alpha, capture.depth(2))))
+        found.append(depth_error(drawn.depth, drawn.alpha, capture.depth(2)).item())
     assert found[1] < 0.7 * found[0]
