@@ -67,6 +67,9 @@ def load(data: Data, seed: int = 0, *, allow_no_points: bool = False, cache_byte
         if data.split == "auto" and capture.split == "none":
             note = f"all of {len(capture.views)} photographs are trained on; with so few, scores need --split fold:1/5 to fold:5/5, or mod8"
             capture = replace(capture, warnings=(*capture.warnings, note))
+        by_depth = capture.points is None and data.init != "random" and any(view.depth for view in capture.views)
+        if by_depth:
+            capture = _points_of_depths(capture)
         if data.normalise == "extent":
             capture = prepare.normalise(replace(capture, extent=prepare.camera_extent(capture)))
         else:
@@ -76,8 +79,9 @@ def load(data: Data, seed: int = 0, *, allow_no_points: bool = False, cache_byte
         if data.init == "random" or (capture.points is None and replaceable):
             capture = _add_random_points(capture, seed, warn=data.init != "random")
         elif capture.points is None:
-            capture = _check_no_points(capture, raw.points_source, allow_no_points)
-        capture = _finish(check_depths(prepare.downscale(capture, policy)))
+            capture = _check_no_points(capture, "the depth maps" if by_depth else raw.points_source, allow_no_points)
+        capture = prepare.downscale(capture, policy)
+        capture = _finish(capture if by_depth else check_depths(capture))
     if data.views is not None:
         capture = choose_views(capture, data.views)
     if data.near is None:
@@ -120,23 +124,21 @@ def _read(data: Data, policy: str, cache_bytes: int | None) -> tuple[RawCapture,
     raw = replace(raw, warnings=warnings)
     if data.split in ("auto", "files"):
         raw = apply_lists(root, raw)
-    raw = _points_of_depths(raw, data)
     raw, omitted = _leave_out(root, raw, data.leave_out)
     capture = _assemble(root, reader.name, raw, data.ignore_principal_point, background, cache_bytes)
     return raw, replace(capture, omitted=omitted)
 
 
-def _points_of_depths(raw: RawCapture, data: Data) -> RawCapture:
-    """Return the capture with the points of its depth maps, where it has maps and no other
-    points."""
-    if raw.points is not None or data.points is not None or data.init == "random":
-        return raw
-    views = [DepthPhoto(i.path, i.lens, i.world_to_cam, i.depth) for i in raw.images if i.lens is not None and i.depth is not None]
-    points = find_points(views)
+def _points_of_depths(capture: Capture) -> Capture:
+    """Return the capture with the points of the depth maps of its training views."""
+    views = [(i, depth) for i in capture.train if (depth := capture.views[i].depth) is not None]
+    pairs = [DepthPhoto(capture.images.sources[i], capture.views[i].camera.world_to_cam.double().numpy(), depth) for i, depth in views]
+    points = find_points(pairs)
     if points is None:
-        return raw
-    note = f"the {len(points.xyz):,} points are those of {len(views)} depth maps; choose others with --points, or --init random"
-    return replace(raw, points=points, points_source="the depth maps", random_points=False, warnings=[*raw.warnings, note])
+        return capture
+    of = "that of one depth map" if len(views) == 1 else f"those of {len(views)} depth maps"
+    note = f"the {len(points.xyz):,} points are {of}; choose others with --points, or --init random"
+    return replace(capture, points=points, warnings=(*capture.warnings, note))
 
 
 def _leave_out(root: Path, raw: RawCapture, written: tuple[str, ...]) -> tuple[RawCapture, tuple[str, ...]]:

@@ -11,14 +11,14 @@ from torch import Tensor
 from scene_experts.core.types import Camera
 from scene_experts.data.views import Capture
 
-SAMPLED = 8  # views that are looked at
 BLOCK = 8  # px: of the points in one block, the nearest is compared, for the others may be hidden
 FEWEST = 20  # points of a view that say something
 AGREE = 1.1  # ratio of depths up to which maps and points have one unit
 
 
 def check_depths(capture: Capture) -> Capture:
-    """Return the capture without its depth maps, and with a note, where its points lie at other depths.
+    """Return the capture without those depth maps whose depths are not those of its points, and with a
+    note; without all of them where that is true of most.
 
     Maps that a network has guessed, or in another unit than the poses, would bend the scene in
     silence. Raises InputError if a map is damaged.
@@ -26,17 +26,18 @@ def check_depths(capture: Capture) -> Capture:
     having = [i for i, view in enumerate(capture.views) if view.depth is not None]
     if not having or capture.points is None or capture.random_points:
         return capture
-    chosen = sorted({having[round(k * (len(having) - 1) / max(SAMPLED - 1, 1))] for k in range(SAMPLED)})
-    ratios = [ratio for i in chosen if (ratio := find_ratio(capture, i)) is not None]
-    if not ratios or float(torch.tensor(ratios).log().abs().median()) <= math.log(AGREE):
+    ratios = {i: ratio for i in having if (ratio := find_ratio(capture, i)) is not None}
+    wrong = [i for i, ratio in ratios.items() if abs(math.log(ratio)) > math.log(AGREE)]
+    if not wrong:
         return capture
-    middle, spread = float(torch.tensor(ratios).median()), max(ratios) / min(ratios)
-    each = "" if spread <= AGREE else f" ({min(ratios):.3g} to {max(ratios):.3g} times in single views)"
+    out = set(having if 2 * len(wrong) > len(ratios) else wrong)
+    found = sorted(ratios[i] for i in wrong)
+    times = f"{found[0]:.3g}" if found[-1] <= AGREE * found[0] else f"{found[0]:.3g} to {found[-1]:.3g}"
     note = (
-        f"the {len(having)} depth maps are left out: the points lie at {middle:.3g} times their depth{each}; "
+        f"{len(out)} of {len(having)} depth maps are left out: the points lie at {times} times their depth; "
         f"give maps in thousandths of the unit of the poses"
     )
-    views = tuple(replace(view, depth=None) for view in capture.views)
+    views = tuple(replace(view, depth=None) if i in out else view for i, view in enumerate(capture.views))
     return replace(capture, views=views, warnings=(*capture.warnings, note))
 
 

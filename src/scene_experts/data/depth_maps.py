@@ -14,14 +14,13 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageOps
 
 from scene_experts.core.errors import InputError
-from scene_experts.core.reading.budget import MASK, PHOTOGRAPH
+from scene_experts.core.reading.budget import DEPTH, PHOTOGRAPH
 from scene_experts.core.reading.pictures import opening_picture
 from scene_experts.core.types import Points
-from scene_experts.data.images import Size, fits
-from scene_experts.data.lens import Lens
+from scene_experts.data.images import ORIENTATION, FrameSource, Size, fits, load_mask
 
 MOST = 100_000  # points of a capture: as many as a reconstruction of many photographs has
 PIXELS = 4 * MOST  # that are looked at
@@ -44,8 +43,7 @@ class DepthFile:
 class DepthPhoto:
     """A photograph with a depth map."""
 
-    photograph: Path
-    lens: Lens
+    source: FrameSource
     world_to_cam: NDArray[np.float64]  # [4, 4]
     depth: DepthFile
 
@@ -58,9 +56,11 @@ def find_points(views: Sequence[DepthPhoto]) -> Points | None:
     places, colors = (np.concatenate([part[k] for part in parts]) if parts else np.zeros((0, 3)) for k in (0, 1))
     if not len(places):
         return None
-    cell = CELL * float(np.median(np.concatenate([part[2] for part in parts])))
+    away = places - places.min(0)
+    cell = max(CELL * float(np.median(np.concatenate([part[2] for part in parts]))), float(away.max()) / 2**20)
     while True:
-        _, first = np.unique(np.floor((places - places.min(0)) / cell).astype(np.int64), axis=0, return_index=True)
+        x, y, z = np.floor(away / cell).astype(np.int64).T
+        _, first = np.unique((x << 42) + (y << 21) + z, return_index=True)
         if len(first) <= MOST:
             break
         cell *= 1.2
@@ -69,24 +69,49 @@ def find_points(views: Sequence[DepthPhoto]) -> Points | None:
 
 
 def read_points(view: DepthPhoto, most: int) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.float64]]:
-    """Return about `most` points [n, 3] of a depth map, their colours [n, 3] and depths [n]."""
-    depth = read_sure(view.depth, (view.lens.width, view.lens.height))
+    """Return at most `most` points [n, 3] of a depth map, where the photograph's mask counts, their
+    colours [n, 3] and depths [n]."""
+    source = view.source
+    depth = read_upright(view.depth, source)
     height, width = depth.shape
+    mask = load_mask(source)
+    if mask is not None:
+        depth[np.asarray(mask.resize((width, height), Image.Resampling.BOX)) < 128] = 0
     rows, columns = np.nonzero(depth)
     if not len(rows):
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0)
-    step = max(1, len(rows) // most)
+    step = -(-len(rows) // most)
     rows, columns = rows[step // 2 :: step], columns[step // 2 :: step]
-    lens, z = view.lens.resize(width, height), depth[rows, columns]
+    lens, z = source.lens.resize(width, height), depth[rows, columns]
     u, v = lens.undistort((columns + 0.5 - lens.cx) / lens.fx, (rows + 0.5 - lens.cy) / lens.fy)
     seen = np.isfinite(u) & np.isfinite(v)
     rows, columns, z = rows[seen], columns[seen], z[seen]
     local = np.stack([u[seen] * z, v[seen] * z, z], 1) - view.world_to_cam[:3, 3]
-    with opening_picture(view.photograph, PHOTOGRAPH) as picture:
-        picture.draft("RGB", (width, height))
-        colors = np.asarray(picture.convert("RGB").resize((width, height), Image.Resampling.BOX))
+    with opening_picture(source.path, PHOTOGRAPH) as picture:
+        picture.draft("RGB", (max(width, height),) * 2)
+        upright = ImageOps.exif_transpose(picture) if source.turn else picture
+        colors = np.asarray(upright.convert("RGB").resize((width, height), Image.Resampling.BOX))
     places = local @ view.world_to_cam[:3, :3]
     return places.astype(np.float64), colors[rows, columns], z
+
+
+def read_upright(file: DepthFile, source: FrameSource) -> NDArray[np.float64]:
+    """Read what is sure of a depth map, [H, W] in units of the capture and 0 elsewhere, turned as its
+    photograph is. Raises InputError as `read_sure`."""
+    turn = 1
+    if source.turn:
+        with opening_picture(source.path, PHOTOGRAPH) as photograph:
+            turn = photograph.getexif().get(ORIENTATION, 1)
+    upright = (source.lens.width, source.lens.height)
+    stored = (upright[1], upright[0]) if turn in (5, 6, 7, 8) else upright
+    if stored != upright:
+        with opening_picture(file.path, DEPTH) as picture:
+            if fits(picture.size, upright) and not fits(picture.size, stored):
+                stored, turn = upright, 1  # the program has turned the map, and not the photograph
+    values = read_sure(file, stored)
+    picture = Image.fromarray(values.astype(np.float32))
+    picture.getexif()[ORIENTATION] = turn
+    return np.array(ImageOps.exif_transpose(picture), np.float64)
 
 
 def read_sure(file: DepthFile, photograph: Size) -> NDArray[np.float64]:
@@ -116,13 +141,22 @@ def read_sure(file: DepthFile, photograph: Size) -> NDArray[np.float64]:
 
 
 def read_depth(file: DepthFile) -> NDArray[np.float64]:
-    """Read a depth map [H, W] in units of the capture; 0 where it knows nothing."""
-    return read_values(file.path) * file.unit
+    """Read a depth map [H, W] in units of the capture; 0 where it knows nothing. Raises InputError if
+    its values are not whole numbers of more than 8 bits."""
+    return read_values(file.path, deep=True) * file.unit
 
 
-def read_values(path: Path) -> NDArray[np.float64]:
-    """Read the values [H, W] of a picture with one channel. Raises InputError for other ones."""
-    with opening_picture(path, MASK) as picture:
+def read_values(path: Path, deep: bool = False) -> NDArray[np.float64]:
+    """Read the values [H, W] of a picture with one channel. Raises InputError for other ones.
+
+    deep: They must be whole numbers of more than 8 bits, as a map in small units is.
+    """
+    with opening_picture(path, DEPTH) as picture:
+        if deep and not picture.mode.startswith("I"):
+            found = {"F": "floating-point numbers", "L": "8 bits"}.get(picture.mode, f"a picture in {picture.mode}")
+            raise InputError(
+                f"expected the depth of {path} in 16 bits, in thousandths of the unit of the poses, found {found}; export the depth again"
+            )
         if len(picture.getbands()) != 1 or picture.mode == "P":
             raise InputError(f"expected one value for each pixel of {path}, found a picture in {picture.mode}; export the depth again")
         return np.asarray(picture).astype(np.float64)

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from PIL import Image, ImageOps
 from torch import Tensor
 
-from scene_experts.core.reading.budget import PHOTOGRAPH
-from scene_experts.core.reading.pictures import opening_picture
-from scene_experts.data.depth_maps import DepthFile, read_sure
-from scene_experts.data.images import ORIENTATION, FrameSource, Size, target_size
+from scene_experts.data.depth_maps import DepthFile, read_upright
+from scene_experts.data.images import FrameSource, Size, target_size
 from scene_experts.data.lens import Lens, to_pinhole
 
 LONGEST = 512  # px of the longer side: more than the map of a phone has
@@ -22,14 +19,8 @@ def read_map(file: DepthFile, source: FrameSource) -> Tensor:
 
     Raises InputError if a file is damaged or does not fit its photograph.
     """
-    lens = source.lens
-    with opening_picture(source.path, PHOTOGRAPH) as photograph:
-        turn = photograph.getexif().get(ORIENTATION, 1) if source.turn else 1
-    values = read_sure(file, (lens.height, lens.width) if turn in (5, 6, 7, 8) else (lens.width, lens.height))
-    picture = Image.fromarray(values.astype(np.float32))
-    picture.getexif()[ORIENTATION] = turn
-    depth = torch.from_numpy(np.array(ImageOps.exif_transpose(picture)))
-    places = find_places(lens, target_size(f"longest:{LONGEST}", source.size))
+    depth = torch.from_numpy(read_upright(file, source).astype(np.float32))
+    places = find_places(source.lens, target_size(f"longest:{LONGEST}", source.size))
     planes = torch.stack((depth, (depth > 0).float()))
     seen, known = torch.nn.functional.grid_sample(planes[None], places[None], padding_mode="zeros", align_corners=False)[0]
     return torch.where(known > 0.999, seen / known.clamp_min(0.5), 0.0)  # beside what is not known, nothing is

@@ -131,7 +131,7 @@ def decode(source: FrameSource) -> tuple[Tensor, Tensor | None]:
     expected size.
     """
     image = _load_pixels(source)
-    mask = _load_mask(source)
+    mask = load_mask(source)
     rgb = image.convert("RGB") if image.mode == "L" else image
     outside = None
     if source.lens.distorted:
@@ -185,7 +185,7 @@ def _load_pixels(source: FrameSource) -> Image.Image:
     return out
 
 
-def _load_mask(source: FrameSource) -> Image.Image | None:
+def load_mask(source: FrameSource) -> Image.Image | None:
     """Load the mask file as L, at its own size. Raises InputError if it has another aspect ratio
     than the photograph.
 

@@ -21,14 +21,20 @@ def test_maps_that_agree_with_the_points_are_kept(tmp_path):
 def test_maps_in_another_unit_are_left_out_and_the_ratio_is_told(tmp_path):
     capture = load(make_depths(tmp_path / "planes", times=0.5, cloud=True))
     told = [w for w in capture.warnings if "depth maps" in w]
-    assert len(told) == 1 and told[0].startswith("the 5 depth maps are left out: the points lie at 2 times their depth; give maps in")
+    assert len(told) == 1 and told[0].startswith("5 of 5 depth maps are left out: the points lie at 2 times their depth; give maps in")
     assert summarise(capture)["depth_maps"] == 0 and capture.depth(0) is None
 
 
-def test_maps_that_disagree_among_themselves_are_left_out(tmp_path, monkeypatch):
+@pytest.mark.parametrize("ratios, left, told", [
+    ((0.5, None, 1.0, 1.0, 2.0), 3, "2 of 5 depth maps are left out: the points lie at 0.5 to 2 times"),
+    ((0.5, 0.8, 1.0, None, 2.0), 0, "5 of 5 depth maps are left out: the points lie at 0.5 to 2 times"),
+    ((1.0, 1.05, 0.95, None, 1.0), 5, ""),
+])  # fmt: skip
+def test_single_maps_are_left_out_or_all_where_most_are_wrong(tmp_path, monkeypatch, ratios, left, told):
     capture = load(make_depths(tmp_path / "planes", cloud=True))
-    monkeypatch.setattr("scene_experts.data.depth_check.find_ratio", lambda _, i: (0.5, 0.8, 1.0, 1.4, 2.0)[i])
-    assert "(0.5 to 2 times in single views)" in check_depths(capture).warnings[-1]
+    monkeypatch.setattr("scene_experts.data.depth_check.find_ratio", lambda _, i: ratios[i])
+    found = check_depths(capture)
+    assert summarise(found)["depth_maps"] == left and (found is capture if left == 5 else found.warnings[-1].startswith(told))
 
 
 def test_hidden_points_do_not_count_and_few_say_nothing(tmp_path):

@@ -1,5 +1,7 @@
 """Points from depth maps: where they lie, their colours, and what is left out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -7,10 +9,13 @@ from PIL import Image
 from scene_experts.core.errors import InputError
 from scene_experts.data import depth_maps
 from scene_experts.data.depth_maps import DepthFile, DepthPhoto, find_points, is_edge
+from scene_experts.data.images import FrameSource
 from scene_experts.data.lens import Lens
+from scene_experts.data.masks import Mask
 from scene_experts.data.readers.polycam import READER
 from scene_experts.data.readers.reader import ReadOptions
 from support.captures import load
+from support.depths import make_depths
 from support.foreign_poses import make_polycam
 from support.messages import naming
 
@@ -26,7 +31,7 @@ def write_view(folder, depth, lens=LENS, pose=None, confidence=None):
     if confidence is not None:
         Image.fromarray(confidence.astype(np.uint8)).save(folder / "sure.png")
     file = DepthFile(folder / "depth.png", 0.001, None if confidence is None else folder / "sure.png")
-    return DepthPhoto(folder / "photo.png", lens, np.eye(4) if pose is None else pose, file)
+    return DepthPhoto(FrameSource(folder / "photo.png", lens, (lens.width, lens.height)), np.eye(4) if pose is None else pose, file)
 
 
 def project(points, view):
@@ -72,9 +77,48 @@ def test_maps_of_another_shape_are_refused(tmp_path):
     view = write_view(tmp_path / "b", np.ones((30, 40)), confidence=np.ones((3, 4)))
     with pytest.raises(InputError, match=naming("sure.png", "4x3")):
         find_points([view])
-    Image.new("RGB", (40, 30)).save(view.depth.path)
-    with pytest.raises(InputError, match=naming("depth.png", "RGB")):
+    for other in (Image.new("RGB", (40, 30)), Image.new("L", (40, 30)), Image.fromarray(np.ones((30, 40), np.float32))):
+        other.save(view.depth.path.with_suffix(".tif"))
+        with pytest.raises(InputError, match=naming("depth.tif", "16 bits")):
+            find_points([replace(view, depth=DepthFile(view.depth.path.with_suffix(".tif"), 0.001))])
+    view.depth.path.write_bytes(view.depth.path.read_bytes()[:60])
+    with pytest.raises(InputError, match=r"whole depth map at .*depth\.png"):
         find_points([view])
+
+
+def test_pixels_that_a_mask_leaves_out_are_no_points(tmp_path):
+    view = write_view(tmp_path / "a", np.full((30, 40), 2.0))
+    Image.fromarray(np.repeat([[0] * 40 + [255] * 40], 60, 0).astype(np.uint8)).save(tmp_path / "mask.png")
+    masked = replace(view, source=replace(view.source, mask=Mask(tmp_path / "mask.png")))
+    u, _, _ = project(find_points([masked]).xyz.numpy(), view)
+    assert u.min() > 40 and u.max() > 78
+
+
+def test_points_of_a_turned_photograph_have_its_colours(tmp_path):
+    view = write_view(tmp_path / "a", np.tile(np.linspace(1, 2, 40), (30, 1)))
+    picture = Image.open(view.source.path)
+    exif = picture.getexif()
+    exif[0x0112] = 6  # clockwise: what is right becomes what is below
+    picture.save(view.source.path, exif=exif)
+    upright = Lens("PINHOLE", 60, 80, (50.0, 50.0, 30.0, 40.0))
+    points = find_points([replace(view, source=replace(view.source, lens=upright, turn=True))])
+    _, y, z = points.xyz.numpy().T
+    rows = 50 * y / z + 40
+    assert np.allclose(z, 1 + (rows / 2 - 0.5) / 39, atol=2e-3) and np.allclose(points.rgb[:, 0].numpy(), 3 * (rows - 0.5), atol=4)
+
+
+def test_only_training_views_give_points(tmp_path):
+    folder = make_depths(tmp_path / "planes", views=8)
+    whole, half = load(folder, split="none"), load(folder, split="mod2")
+    assert [any(f"those of {n} depth maps" in w for w in c.warnings) for n, c in ((8, whole), (4, half))] == [True, True]
+    one = load(folder, split="none", leave_out=tuple(f"images/{i}.png" for i in range(1, 8)))
+    assert any("that of one depth map;" in w for w in one.warnings)
+
+
+def test_maps_that_know_nothing_are_named(tmp_path):
+    folder = make_depths(tmp_path / "planes", times=0.0)
+    with pytest.raises(InputError, match="expected 3D points in the depth maps"):
+        load(folder, init="points")
 
 
 def test_a_capture_of_a_phone_with_lidar_starts_from_its_depth(tmp_path):
@@ -87,6 +131,6 @@ def test_a_capture_of_a_phone_with_lidar_starts_from_its_depth(tmp_path):
         Image.fromarray(np.full((32, 48), 2500, np.uint16)).save(tmp_path / f"keyframes/depth/{name}.png")
     raw = READER.read(tmp_path, ReadOptions())
     assert sum(image.depth is not None for image in raw.images) == 3 and not any("no points" in w for w in raw.warnings)
-    capture = load(tmp_path)
+    capture = load(tmp_path, split="none")
     assert capture.points is not None and any("those of 3 depth maps" in w for w in capture.warnings) and made.images
     assert not any("depth maps" in w for w in load(tmp_path, init="random").warnings)

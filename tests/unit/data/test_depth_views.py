@@ -69,6 +69,8 @@ def test_a_map_is_turned_with_its_photograph(tmp_path):
     turned = read_map(file, FrameSource(source.path, upright, (30, 40), turn=True))
     assert turned.shape == (40, 30)
     torch.testing.assert_close(turned[:, 15], torch.from_numpy(values[15]).float(), atol=2e-3, rtol=0)  # right became down
+    Image.fromarray((1000 * np.rot90(values, -1)).round().astype(np.uint16)).save(file.path)  # a map that is turned already
+    torch.testing.assert_close(read_map(file, FrameSource(source.path, upright, (30, 40), turn=True)), turned)
 
 
 def test_a_large_map_has_at_most_so_many_pixels(tmp_path):

@@ -88,6 +88,7 @@ POINTS = Budget("PLY file of points", 16 * GIB, items=4_096, advice="copy it aga
 PHOTOGRAPH = Budget("image", 2 * GIB, floor=192 * MIB, ratio=40, advice="replace it, or leave it out with --leave-out")
 CAPTURED = Budget("photograph or mask", 2 * GIB, floor=512 * MIB, ratio=40, advice="replace or remove it")  # before a reconstruction
 MASK = Budget("mask", 1 * GIB, floor=512 * MIB, ratio=40, advice="replace or remove it")
+DEPTH = Budget("depth map", 1 * GIB, floor=512 * MIB, ratio=40, advice="export it again")
 PICTURE = Budget("picture", 1 * GIB, floor=160 * MIB, ratio=40, advice="evaluate the run again")
 
 # --- scenes -------------------------------------------------------------------------------------------------------------------------------
