@@ -17,8 +17,8 @@ AGREE = 1.1  # ratio of depths up to which maps and points have one unit
 
 
 def check_depths(capture: Capture) -> Capture:
-    """Return the capture without those depth maps whose depths are not those of its points, and with a
-    note; without all of them where that is true of most.
+    """Return the capture without those depth maps whose depths are not those of its points, and with
+    a note; without all of them where that is true of most.
 
     Maps that a network has guessed, or in another unit than the poses, would bend the scene in
     silence. Raises InputError if a map is damaged.

@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from scene_experts.data.depth_maps import DepthFile, read_upright
-from scene_experts.data.images import FrameSource, Size, target_size
-from scene_experts.data.lens import Lens, to_pinhole
+from scene_experts.data.images import FrameSource, make_grid, target_size
 
 LONGEST = 512  # px of the longer side: more than the map of a phone has
 
@@ -20,19 +19,7 @@ def read_map(file: DepthFile, source: FrameSource) -> Tensor:
     Raises InputError if a file is damaged or does not fit its photograph.
     """
     depth = torch.from_numpy(read_upright(file, source).astype(np.float32))
-    places = find_places(source.lens, target_size(f"longest:{LONGEST}", source.size))
+    places = make_grid(source.lens, target_size(f"longest:{LONGEST}", source.size))
     planes = torch.stack((depth, (depth > 0).float()))
     seen, known = torch.nn.functional.grid_sample(planes[None], places[None], padding_mode="zeros", align_corners=False)[0]
     return torch.where(known > 0.999, seen / known.clamp_min(0.5), 0.0)  # beside what is not known, nothing is
-
-
-def find_places(lens: Lens, size: Size) -> Tensor:
-    """Return where the pixels of an undistorted picture of `size` lie in the photograph, [h, w, 2]
-    float32 in [-1, 1], for grid_sample; 2 where the photograph does not show them."""
-    flat = to_pinhole(lens).resize(*size)
-    rays = np.meshgrid((np.arange(size[0]) + 0.5 - flat.cx) / flat.fx, (np.arange(size[1]) + 0.5 - flat.cy) / flat.fy)
-    u, v = lens.distort(*rays) if lens.distorted else rays
-    places = np.stack(((u * lens.fx + lens.cx) * 2 / lens.width - 1, (v * lens.fy + lens.cy) * 2 / lens.height - 1), 2)
-    if lens.distorted:
-        places[lens.is_folded(*rays)] = 2
-    return torch.from_numpy(places.astype(np.float32))

@@ -222,10 +222,14 @@ def _turn_mask(source: FrameSource, out: Image.Image, shaped: bool) -> Image.Ima
 
 
 @functools.lru_cache(maxsize=2)  # neighbouring views share their camera
-def _make_grid(lens: Lens) -> Tensor:
+def make_grid(lens: Lens, size: Size | None = None) -> Tensor:
     """Return where each pixel of the undistorted image lies in the photograph: [h, w, 2] float32 in
-    [-1, 1], for grid_sample."""
-    pinhole = to_pinhole(lens)
+    [-1, 1], for grid_sample; 2 where the photograph does not show it.
+
+    size: Width and height of the undistorted image; None is that of the photograph. The views of
+    panoramas have one size.
+    """
+    pinhole = to_pinhole(lens) if size is None else to_pinhole(lens).resize(*size)
     if lens.model == PANORAMA_VIEW:
         view = PanoramaView(round(lens.value("yaw")), round(lens.value("pitch")))
         places = find_places(view, pinhole.width, (lens.width, lens.height))
@@ -246,7 +250,7 @@ def _undistort(image: Image.Image, lens: Lens) -> Image.Image:
     """Undistort `image` with bilinear interpolation. Its border is repeated outside."""
     pixels = np.array(image)
     planes = torch.from_numpy(pixels.reshape(*pixels.shape[:2], -1)).permute(2, 0, 1)[None].float()
-    grid = _make_grid(lens)
+    grid = make_grid(lens)
     strips = [
         torch.nn.functional.grid_sample(planes, grid[None, top : top + 256], padding_mode="border", align_corners=False)[0].round().byte()
         for top in range(0, grid.shape[0], 256)
@@ -257,5 +261,5 @@ def _undistort(image: Image.Image, lens: Lens) -> Image.Image:
 def _make_outside_mask(lens: Lens) -> Image.Image | None:
     """Return a mask that is black where the undistorted image exceeds the photograph, or None if it
     nowhere does."""
-    inside = (_make_grid(lens).abs() <= 1).all(-1)
+    inside = (make_grid(lens).abs() <= 1).all(-1)
     return None if bool(inside.all()) else Image.fromarray(inside.numpy().astype(np.uint8) * 255)

@@ -84,9 +84,9 @@ def as_trained(rasterize: Rasterizer, antialias: bool) -> Rasterizer:
 
 
 def for_training(rasterize: Rasterizer, absolute: bool, depth: bool = False) -> Rasterizer:
-    """Return the rasteriser without the depth, unless the loss sees it and where it can leave it out, and
-    whose `mean2d_grad` holds sums of absolute values if `absolute`. Raises InputError if it has
-    none."""
+    """Return the rasteriser as a training uses it: without the depth where it can leave it out and the
+    loss does not see it (`depth`), and with sums of absolute values in `mean2d_grad` if `absolute`.
+    Raises InputError if it has none."""
     if hasattr(rasterize, "depth"):
         rasterize = replace(rasterize, depth=depth)  # type: ignore[type-var]
     if not absolute:

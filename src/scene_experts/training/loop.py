@@ -229,8 +229,8 @@ def see_view(
     photographs = resident_of(training, run, capture)
     target, mask = photographs.see(index)
     training.seed_view(number)
-    direct = direct_of(training, rasterize, scene)
-    if direct is not None and not direct.refused:
+    direct, depth = direct_of(training, rasterize, scene), photographs.depth(index) if cfg.loss.depth else None
+    if direct is not None and not direct.refused and depth is None:
         decoded, render, terms = direct.see(scene, camera, number, target, mask, photographs.background(color))
         training.largest.see(decoded, render)
         return Iteration(decoded, render, terms, target, mask)
@@ -240,7 +240,6 @@ def see_view(
     drawn = decoded.gaussians if pose is None else attach(decoded.gaussians, pose)
     render = rasterize(drawn, camera, photographs.background(color))
     render = replace(render, image=scene.as_photographed(render.image, camera))
-    depth = photographs.depth(index) if cfg.loss.depth else None
     parts = compute_terms(Sample(decoded, render, target, mask, number, depth), cfg.loss)
     loss = torch.stack(list(parts.values())).sum()
     if loss.requires_grad:

@@ -190,9 +190,9 @@ Weights.terms = (photometric_terms, depth_term, *SCENE_TERMS)
 def depth_error(drawn: Tensor, alpha: Tensor, known: Tensor, mask: Tensor | None = None) -> Tensor:
     """Mean over all pixels of the relative error of the depth, at most 0.2 each, [].
 
-    A pixel counts where its depth is known, its mask is above 0.5 and the scene is nearly opaque; the others have no
-    error. So a map that is wrong somewhere has little weight there, and the scene is not made
-    opaque or transparent.
+    A pixel counts where its depth is known, its mask is above 0.5 and the scene is nearly opaque;
+    the others have no error. So a map that is wrong somewhere has little weight there, and the
+    scene is not made opaque or transparent.
 
     Args:
         drawn: [H, W] depth of a `Render`, which is not divided by alpha.
