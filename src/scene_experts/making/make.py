@@ -145,7 +145,7 @@ def find_poses(source: Path, folder: Path, options: SourceOptions, say: Callable
     folder.mkdir(parents=True, exist_ok=True)
     write_json(note, {"source": here})  # before the capture: a call that is killed between the two goes on
     try:
-        found = reconstruct(source, place, SfmOptions(**asdict(options)), say=say, progress=progress)
+        found = reconstruct(source, place, SfmOptions(**asdict(options)), few=recipe(PROPOSED).dense_views, say=say, progress=progress)
     except InputError:
         forget_empty(folder, place, note)
         raise

@@ -33,14 +33,23 @@ from scene_experts.sfm.options import SfmOptions
 from scene_experts.sfm.pairs import choose_pairs, find_alike
 from scene_experts.sfm.panoramas import PanoramaRig, choose_held_out, cuts, take_photos
 from scene_experts.sfm.photos import Photo
+from scene_experts.sfm.worker import ENOUGH
 
 LOG, VIDEO, FRAMES = "colmap.log", "video.txt", "frames"
 TEST = "test.txt"  # lists the views that a training holds out
 LEARNED = "database/learned"  # features and matches of networks, removed with the database
+ENOUGH_FOR_POSES = 3000  # features of a photograph; half of sceaux's, statue's or brighton's move no camera by 0.1 % of the extent
 
 
 def reconstruct(
-    source: Path, out: Path, options: SfmOptions, *, overwrite: bool = False, say: Say = print, progress: Progress = lambda *_: None
+    source: Path,
+    out: Path,
+    options: SfmOptions,
+    *,
+    overwrite: bool = False,
+    few: int = 0,
+    say: Say = print,
+    progress: Progress = lambda *_: None,
 ) -> dict[str, Any]:
     """Make the capture `out` from the photographs in the folder `source`, or from the frames of the
     video `source`.
@@ -50,6 +59,8 @@ def reconstruct(
 
     Args:
         overwrite: Replace an existing capture once the new one is complete.
+        few: Number of photographs up to which the points are not needed, as a training starts from
+            denser ones: the smallest features are then left out where there are enough others.
         say: Called with each message.
         progress: Called with the name of the work, how much is done and how much there is.
 
@@ -81,8 +92,9 @@ def reconstruct(
         said = f"{len(found)} {kind}, {len(groups)} camera{'s' if len(groups) > 1 else ''}"
         say(f"{said}, {len(pairs):,} pairs to match" if pairs is not None else said)
         masks = write_masks(found, images, folder / "masks")
-        prepare_folder(folder, found, options, masks)
-        request = describe_request(folder, images, groups, rig, bool(masks), pairs, names, options)
+        enough = ENOUGH_FOR_POSES if len(found) <= few and options.features != "learned" else None
+        prepare_folder(folder, found, options, masks, enough)
+        request = {**describe_request(folder, images, groups, rig, bool(masks), pairs, names, options), "enough": enough}
         began = time.monotonic()
         spare: list[tuple[int, int]] = []
         if pairs is None:
@@ -203,7 +215,7 @@ def run_features(
     if options.features == "learned":
         run({**request, "poses": False})
         return {**attempt.reconstruct_with(shots, pairs, request, run, say, progress), "features": "SIFT and ALIKED"}
-    result = run(request)
+    result, request = find_poses(request, folder, run, say)
     if not attempt.is_wanted(options.features, result, len(shots.names), say):
         return result
     model, mapper = Path(request["model"]), "incremental" if options.mapper == "auto" else options.mapper
@@ -215,6 +227,25 @@ def run_features(
         say(f"warning: the result without learned features is kept, because they failed: {error}")
         return result
     return attempt.keep_better(result, other, len(shots.names), (model, Path(again["model"])), say)
+
+
+def find_poses(request: dict[str, Any], folder: Path, run: attempt.Worker, say: Say) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Find poses by COLMAP's features. Where those without the smallest were asked for and leave more
+    than a tenth of the photographs without a pose, the smallest are added. Returns the result and
+    the request that led to it."""
+    if request["enough"] is None:
+        return run(request), request
+    result = run({**request, "mapper": "incremental"} if request["mapper"] == "auto" else request)
+    total = sum(map(len, request["groups"]))
+    if len(result["registered"]) >= ENOUGH * total:
+        return result, request
+    if result["large_features"]:
+        say(f"{total - len(result['registered'])} of {total} photographs have no pose yet: smaller features are searched for, too")
+    for left in (folder / "maps", Path(request["model"])):
+        work.remove(left)
+    database = request["database"] + ".all" if result["large_features"] else request["database"]
+    request = {**request, "database": database, "enough": None}
+    return run(request), request
 
 
 def warn_of_mapper(result: dict[str, Any], options: SfmOptions) -> str | None:
@@ -276,13 +307,19 @@ def extract_photos(video: Path, images: Path, options: SfmOptions, progress: Pro
     return photos.find_photos(images)
 
 
-def prepare_folder(folder: Path, found: list[Photo], options: SfmOptions, masks: list[str]) -> None:
+def prepare_folder(folder: Path, found: list[Photo], options: SfmOptions, masks: list[str], enough: int | None) -> None:
     """Empty the work folder for this request. The database is kept if it holds features of the same
     photographs and masks.
 
-    masks: Checksums of the masks.
+    masks: Checksums of the masks. enough: Features of a photograph without the smallest ones.
     """
-    facts = [[(photo.name, photo.size, photo.camera, photo.stamp) for photo in found], options.camera_model, options.max_side, masks]
+    facts = [
+        [(photo.name, photo.size, photo.camera, photo.stamp) for photo in found],
+        options.camera_model,
+        options.max_side,
+        masks,
+        enough,
+    ]
     mark = hashlib.sha256(json.dumps(facts).encode()).hexdigest()
     database, note = folder / "database", folder / "database" / "of.txt"
     if not note.is_file() or note.read_text() != mark:

@@ -137,7 +137,7 @@ def test_a_repeated_call_continues_the_training_and_keeps_the_page(capture, tmp_
 def test_photographs_get_poses_first(tmp_path, capture, trained, monkeypatch):
     asked = []
 
-    def reconstruct(source, out, options, say, progress):
+    def reconstruct(source, out, options, few, say, progress):
         asked.append((out, options))
         make_capture(out, views=9, size=(48, 32), points=200)
         (out / "capture.json").write_text(json.dumps({"options": asdict(options)}))
@@ -160,7 +160,7 @@ def test_photographs_get_poses_first(tmp_path, capture, trained, monkeypatch):
 def test_a_call_that_can_use_nothing_leaves_no_folder_and_a_killed_one_goes_on(tmp_path, monkeypatch):
     left = []
 
-    def reconstruct(source, out, options, say, progress):
+    def reconstruct(source, out, options, few, say, progress):
         assert (out.parent / making.SOURCE).is_file()  # a kill after the capture is complete leaves the note too
         out.mkdir(exist_ok=True)
         for name in left:

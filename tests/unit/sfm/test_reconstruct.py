@@ -300,6 +300,30 @@ def test_learned_features_are_tried_where_colmaps_fail_and_the_better_result_is_
     assert any("2 of 3" in line for line in said) and not (tmp_path / "out" / NAME).exists()
 
 
+def test_where_poses_suffice_the_smallest_features_are_added_only_where_photographs_have_no_pose(tmp_path, monkeypatch):
+    """`few` is the number of photographs up to which the points are not needed."""
+    for large, all_posed in ((True, True), (True, False), (False, False)):
+        answers = [{**FOUND, "large_features": large, "registered": ["0.jpg", "1.jpg", "2.jpg"][: 3 if all_posed else 1]}, FOUND]
+        requests, said, out = [], [], tmp_path / f"{large}{all_posed}"
+
+        def answer(request, log, say, progress, requests=requests, answers=answers):
+            requests.append(request)
+            Path(request["maps"]).mkdir(parents=True)
+            Path(request["model"]).mkdir(parents=True)
+            return {"step": "done", "version": "0", **answers[len(requests) - 1]}
+
+        monkeypatch.setattr(run, "run_worker", answer)
+        run.reconstruct(write_black(tmp_path / "photos"), out, SfmOptions(), few=3, say=said.append)
+        asked = [(request["enough"], request["mapper"]) for request in requests]
+        assert asked == [(run.ENOUGH_FOR_POSES, "incremental"), (None, "auto")][: 1 if all_posed else 2]
+        assert all_posed or (requests[0]["database"] != requests[1]["database"]) is large  # else the same features serve again
+        assert any("2 of 3" in line for line in said) is (large and not all_posed)
+    worker = fake_worker(**FOUND)
+    monkeypatch.setattr(run, "run_worker", worker)
+    make(tmp_path / "photos", tmp_path / "more", few=2)
+    assert [request["enough"] for request in worker.requests] == [None]
+
+
 def test_learned_features_are_asked_for_at_once(tmp_path, monkeypatch, networks):
     worker = fake_worker(**FOUND)
     monkeypatch.setattr(run, "run_worker", worker)

@@ -207,3 +207,51 @@ def test_learned_matches_are_added_to_those_that_colmap_verified(tmp_path, monke
     assert written[2][2:].tolist() == [[6, 6, 1, 0, 0, 1], [7, 8, 1, 0, 0, 1]]  # behind the two of COLMAP
     assert written[1, 2] == [[0, 1], [1 + 1, 2 + 0]] and written[2, 3] == [[2 + 1, 0]] and len(written[3]) == 2
     assert written["pairs"] == ["1.jpg 2.jpg", "2.jpg 3.jpg"] and written["seed"] == 4
+
+
+def test_the_smallest_features_are_left_out_where_two_photographs_have_enough_others(tmp_path, monkeypatch, capsys):
+    """A photograph of this COLMAP has so many features of two orientations as its name says, twice as many with the smallest ones."""
+    kept: dict[str, dict[str, int]] = {}
+
+    class Database:
+        def __init__(self, path):
+            self.path = path
+
+        def read_all_images(self):
+            return [SimpleNamespace(name=name, image_id=name, camera_id=7) for name in kept.get(self.path, {})]
+
+        def exists_descriptors(self, name):
+            return True
+
+        def read_keypoints(self, name):
+            return np.repeat(np.arange(4.0 * kept[self.path][name]).reshape(-1, 4), 2, axis=0)
+
+    class Opened(Database):
+        @staticmethod
+        @contextmanager
+        def open(path):
+            yield Database(path)
+
+    def extract(database, images, names, *, extraction_options, **_):
+        there = 1 if extraction_options.sift.first_octave == 0 else 2
+        Path(database).touch()
+        kept.setdefault(database, {}).update({name: there * int(name.split(".")[0].split("/")[-1]) for name in names})
+
+    def made():
+        return SimpleNamespace(sift=SimpleNamespace(max_num_features=8192, first_octave=-1))
+
+    colmap = SimpleNamespace(
+        FeatureExtractionOptions=made,
+        ImageReaderOptions=SimpleNamespace,
+        extract_features=extract,
+        Database=Opened,
+        CameraMode=SimpleNamespace(SINGLE=0),
+        Device=SimpleNamespace(cpu=0),
+    )
+    ask = {"images": "", "masks": "", "camera_model": "OPENCV", "rig": None, "threads": 1, "max_side": 1600}
+    rich, some = [f"{9000 + i}.jpg" for i in range(12)], [f"{4000 + i}.jpg" for i in range(12)]
+    for case, (names, enough, large) in enumerate([(rich, None, True), (some, None, False), (some, 3000, True), (rich[:7], None, False)]):
+        database = str(tmp_path / f"{case}.db")
+        assert worker.extract_features(colmap, {**ask, "database": database, "groups": [names], "enough": enough}) is large
+        assert set(kept[database]) == set(names)
+        assert all(count == (1 if large else 2) * int(name.split(".")[0]) for name, count in kept[database].items())
