@@ -215,10 +215,15 @@ def train(
         The run.
 
     Raises:
-        InputError: A setting is invalid, the capture cannot be used, or the folder cannot hold the
-            run.
+        InputError: A setting is unknown or invalid, the capture cannot be used, or the folder cannot
+            hold the run.
         RunError: A loss is not finite, or a file cannot be written.
     """
+    if unknown := sorted(settings.keys() - Settings.__annotations__.keys()):
+        raise InputError(
+            f"expected settings of a training ({', '.join(Settings.__annotations__)}), found {unknown[0]}; "
+            f"numbers of the recipe are given to it: train(recipe(..., {unknown[0]}=...), ...)"
+        )
     trainer = Trainer(method, capture, out, **settings)
     console = Console(markup=False, highlight=False, quiet=not progress)
     with saved_on_interrupt(trainer, out is not None), TrainingProgress(console, out=Path(out) if out is not None else None) as show:

@@ -151,6 +151,11 @@ def test_settings_that_cannot_be_used_are_named(capture, settings, said):
     assert "\n" not in str(error.value)
 
 
+def test_a_number_of_the_recipe_is_told_from_a_setting(capture):
+    with pytest.raises(se.InputError, match=r"found iterations.*recipe\(..., iterations=...\)"):
+        se.train("moe-gs", capture, iterations=3)  # type: ignore[call-arg]
+
+
 def test_numbers_of_numpy_are_written_as_plain_ones(folder, small, tmp_path):
     read = {"max_views": np.int64(8), "near": np.float32(0.25), "ignore_principal_point": np.bool_(True)}
     capture = se.load_capture(folder, background=(np.float32(0), 0, 1), **read)
