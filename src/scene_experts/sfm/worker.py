@@ -10,6 +10,7 @@ stopped.
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import sys
@@ -23,6 +24,7 @@ PAIRS = 200  # pairs per progress message during matching
 ENOUGH = 0.9  # fraction of photographs with a pose at which the second mapper is not tried
 FEW_FITTING = 4  # other photographs that fit one
 GROWN = 1.3  # times as many photographs or points as at the last adjustment of all poses, from which on they are adjusted anew
+NEAR = 0.9  # share of the angle of a first pair from which COLMAP may find it
 FEW_FEATURES = 200  # a sharp photograph has thousands
 PROBED = 8  # photographs of a camera from which on two of them show whether the smallest features are needed
 
@@ -318,6 +320,9 @@ def map_incrementally(colmap: Any, ask: dict[str, Any], out: str, total: int) ->
     if ask["rig"] is not None:
         options.ba_refine_sensor_from_rig = False
         options.constant_cameras = find_cut_cameras(colmap, ask)
+    elif not has_wide_pair(colmap, ask, options.mapper):  # the first pair is the one that COLMAP's third search would find
+        options.mapper.init_min_num_inliers //= 2
+        options.mapper.init_min_tri_angle /= 2
 
     def start() -> None:  # from two photographs; again where they lead nowhere, and for photographs that do not fit the others
         nonlocal count, attempt
@@ -331,6 +336,31 @@ def map_incrementally(colmap: Any, ask: dict[str, Any], out: str, total: int) ->
 
     calls = {"initial_image_pair_callback": start, "next_image_callback": count_image}
     return colmap.incremental_mapping(ask["database"], ask["images"], out, options=options, **calls)
+
+
+def has_wide_pair(colmap: Any, ask: dict[str, Any], wanted: Any) -> bool:
+    """Return whether a pair of photographs may have the angle that COLMAP wants of the first pair.
+
+    COLMAP searches all pairs for one, 30 ms each, then again with half of the inliers, then with
+    half of the angle. The frames of a video often have none. A pair takes 1 ms here.
+    """
+    with colmap.Database.open(ask["database"]) as there:
+        images = {image.image_id: image for image in there.read_all_images()}
+        cameras = {camera.camera_id: camera for camera in there.read_all_cameras()}
+        pairs = sorted(zip(*there.read_two_view_geometries()), key=lambda pair: -len(pair[1].inlier_matches))
+        places: dict[int, Any] = {}
+        for key, geometry in pairs:
+            if len(geometry.inlier_matches) < wanted.init_min_num_inliers // 2:
+                break
+            sides = []
+            for i in colmap.pair_id_to_image_pair(key):
+                if i not in places:
+                    places[i] = there.read_keypoints(i)[:, :2].astype(float)
+                sides += [cameras[images[i].camera_id], places[i]]
+            colmap.estimate_two_view_geometry_pose(*sides, geometry)
+            if geometry.tri_angle >= math.radians(NEAR * wanted.init_min_tri_angle):
+                return True
+    return False
 
 
 def find_cut_cameras(colmap: Any, ask: dict[str, Any]) -> set[int]:
