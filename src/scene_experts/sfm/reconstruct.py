@@ -251,7 +251,7 @@ def find_poses(request: dict[str, Any], folder: Path, run: attempt.Worker, say: 
 def warn_of_mapper(result: dict[str, Any], options: SfmOptions) -> str | None:
     """Return a warning if the poses are those of the global mapper after the incremental one had
     failed: it may give every photograph a pose, and wrong ones."""
-    if options.mapper != "auto" or result.get("mapper") != "global":
+    if options.mapper != "auto" or result.get("mapper") != "global" or result.get("one_focal_length"):
         return None
     return (
         "warning: these poses are those of the global mapper, because the incremental one fitted too few photographs together; "

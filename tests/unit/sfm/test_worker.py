@@ -285,3 +285,47 @@ def test_the_first_pair_is_searched_with_half_of_the_angle_where_no_pair_has_all
     )
     mapper = SimpleNamespace(init_min_num_inliers=100, init_min_tri_angle=16.0)
     assert worker.has_wide_pair(colmap, {"database": ""}, mapper) is wide
+
+
+@pytest.mark.parametrize(
+    ("lenses", "posed", "errors", "kept"),
+    [
+        ([(834.2, 2109.0), (900.0,)], (5, 5), (0.31, 0.33), True),
+        ([(834.2, 2109.0), (900.0,)], (5, 4), (0.31, 0.33), False),  # fewer photographs fit
+        ([(600.0, 800.0), (700.0,)], (5, 5), (0.4, 1.9), False),  # the pixels are no squares
+        ([(600.0, 610.0)], (5,), (0.4,), None),
+    ],
+)
+def test_a_lens_with_two_focal_lengths_is_sought_again_with_one(tmp_path, monkeypatch, capsys, lenses, posed, errors, kept):
+    asked, camera = [], SimpleNamespace(camera_id=3, width=288, height=360, has_prior_focal_length=False)
+    updated = []
+
+    def estimate(colmap, ask):
+        i = len(asked)
+        asked.append(ask)
+        Path(ask["model"]).mkdir(parents=True)
+        (Path(ask["model"]) / "cameras.bin").write_text(str(i))
+        lens = {"width": 288, "model": "OPENCV" if len(lenses[i]) == 2 else "RADIAL", "params": [*lenses[i], 144.0, 180.0]}
+        return {
+            "registered": ["a"] * posed[i],
+            "lacking": [],
+            "mapper": "incremental",
+            "mappers": {},
+            "error": errors[i],
+            "cameras": [lens],
+        }
+
+    @contextmanager
+    def open_database(path):
+        yield SimpleNamespace(read_all_cameras=lambda: [camera], update_camera=updated.append)
+
+    colmap = SimpleNamespace(Camera=SimpleNamespace, Database=SimpleNamespace(open=open_database))
+    monkeypatch.setattr(worker, "estimate_poses", estimate)
+    ask = {"maps": str(tmp_path / "maps"), "model": str(tmp_path / "model"), "database": "", "mapper": "auto"}
+    found = worker.estimate_all(colmap, ask)
+    assert len(asked) == len(lenses) and (tmp_path / "model" / "cameras.bin").read_text() == ("1" if kept else "0")
+    assert found["cameras"][0]["model"] == ("RADIAL" if kept else "OPENCV") and [path.name for path in tmp_path.glob("mo*")] == ["model"]
+    if kept is not None:
+        assert asked[1]["mapper"] == "global" and updated[0].params == [min(lenses[0]), 144.0, 180.0, 0.0, 0.0]
+        assert updated[0].model == "RADIAL" and updated[0].camera_id == 3
+        assert json.loads(capsys.readouterr().out.splitlines()[-1])["kept"] is kept
