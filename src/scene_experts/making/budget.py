@@ -22,7 +22,7 @@ CLOSE = (0.8, 1.3)  # a training whose time will be this share of what it has is
 LEAST, MOST, MOST_OF_FEW = 300, 30_000, 7_000  # iterations; the last with few photographs (`bench.advice.FEW`)
 FIRST_OF_FEW = 2_000
 """Iterations of few photographs without --minutes: half of what `info` proposes. Twice as many gain 0.1 to
-0.3 dB and 5 % of LPIPS, and are three quarters of the whole time (results/to-page.md)."""
+0.3 dB and 5 to 8 % of LPIPS, and are three quarters of the whole time (results/to-page.md)."""
 PAGE_GUESS, SCORES_GUESS = 20.0, 40.0  # seconds, before anything is known
 
 
