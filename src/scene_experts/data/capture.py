@@ -23,7 +23,7 @@ from scene_experts.data.depth_check import check_depths
 from scene_experts.data.depth_maps import DepthPhoto, find_points
 from scene_experts.data.equirectangular import find_place
 from scene_experts.data.images import FrameSource, check_policy, probe
-from scene_experts.data.lens import centre_principal_point, tell_stretched, to_pinhole
+from scene_experts.data.lens import centre_principal_point, to_pinhole
 from scene_experts.data.masks import find_masks
 from scene_experts.data.match import NameIndex, to_relative_name
 from scene_experts.data.orientation import fit_lenses
@@ -270,7 +270,7 @@ def _finish(capture: Capture) -> Capture:
     sizes = {(v.camera.width, v.camera.height) for v in views}
     if len(sizes) > 1:
         notes.append(f"views of {len(sizes)} sizes")
-    notes += tell_stretched((float(view.camera.K[0, 0]), float(view.camera.K[1, 1])) for view in views)
+    notes += prepare.tell_stretched((float(view.camera.K[0, 0]), float(view.camera.K[1, 1])) for view in views)
     if capture.points is not None and len(capture.points.xyz) < 500:
         notes.append(f"only {len(capture.points.xyz)} points to start from")
     return replace(capture, views=views, warnings=tuple(map(sentence, notes)))  # they quote names of files

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +21,6 @@ from scene_experts.data.equirectangular import PanoramaView, view_side
 from scene_experts.data.lens_forms import LARGEST_ANGLE
 
 Array = NDArray[np.floating]
-STRETCHED = 1.1  # ratio of two focal lengths from which on no lens has them
 
 # COLMAP's models in the order of their ids, then ours. "f" stands for fx = fy. The coefficients of RAD_TAN_THIN_PRISM_FISHEYE, which
 # COLMAP numbers from 0, are named like those of the other models.
@@ -308,15 +307,3 @@ def centre_principal_point(lens: Lens) -> Lens:
     """Move the principal point of `lens` to the image centre, as code that ignores it assumes."""
     centre = {"cx": lens.width / 2, "cy": lens.height / 2}
     return replace(lens, params=tuple(centre.get(n, p) for n, p in zip(MODELS[lens.model], lens.params)))
-
-
-def tell_stretched(focal: Iterable[tuple[float, float]]) -> list[str]:
-    """Say if two focal lengths (fx, fy) in pixels differ as no lens's do. Photographs that do not
-    tell them apart, a drone's from one height, fit a scene that is stretched in the same way."""
-    x, y = max(focal, key=lambda pair: max(pair) / max(min(pair), 1e-9), default=(1.0, 1.0))
-    if max(x, y) < STRETCHED * min(x, y):
-        return []
-    return [
-        f"a lens has the focal lengths {x:,.0f} and {y:,.0f} px; unless its pixels are no squares, the scene is stretched: find the poses "
-        "again with `scene-experts capture`, or with one focal length (COLMAP's RADIAL)"
-    ]

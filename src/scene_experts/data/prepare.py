@@ -1,5 +1,5 @@
 """Functions from a capture to a capture: select views, split, resize, transform the world, drop
-outliers, add random points.
+outliers, add random points; and what is told of lenses.
 
 `load` is built from them, and each can be applied to a loaded capture. They read no pixels and do
 not modify their argument.
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,6 +24,7 @@ from scene_experts.data.store import ImageStore
 from scene_experts.data.views import Capture, Vector, View, World
 
 RANDOM_POINTS = 10_000  # as 3DGS for NeRF-synthetic scenes
+STRETCHED = 1.1  # ratio of two focal lengths from which on no lens has them
 FEW = 12  # with fewer views, all are trained on unless the user holds some out
 NORMAL_EXTENT = 5.0  # extent of a capture in a normalised world
 _FAR_VIEW = 50.0  # a camera further from the median camera than this many median distances is mislocated
@@ -265,3 +266,15 @@ def add_random_points(capture: Capture, count: int = RANDOM_POINTS, seed: int = 
     xyz = corners[0] + torch.from_numpy(rng.random((count, 3))) * (corners[1] - corners[0])
     grey = torch.from_numpy(rng.integers(118, 138, (count, 3)).astype(np.uint8))
     return replace(capture, points=Points(xyz, grey))
+
+
+def tell_stretched(focal: Iterable[tuple[float, float]]) -> list[str]:
+    """Say if two focal lengths (fx, fy) in pixels differ as no lens's do. Photographs that do not
+    tell them apart, a drone's from one height, fit a scene that is stretched in the same way."""
+    x, y = max(focal, key=lambda pair: max(pair) / max(min(pair), 1e-9), default=(1.0, 1.0))
+    if max(x, y) < STRETCHED * min(x, y):
+        return []
+    return [
+        f"a lens has the focal lengths {x:,.0f} and {y:,.0f} px; unless its pixels are no squares, the scene is stretched: find the poses "
+        "again with `scene-experts capture`, or with one focal length (COLMAP's RADIAL)"
+    ]

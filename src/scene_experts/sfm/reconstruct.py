@@ -21,6 +21,7 @@ from scene_experts.core.io import read_json, write_bytes, write_json
 from scene_experts.core.progress import Progress
 from scene_experts.data.equirectangular import find_place
 from scene_experts.data.match import EXTENSIONS
+from scene_experts.data.prepare import STRETCHED
 from scene_experts.data.readers import is_capture
 from scene_experts.native import library as native
 from scene_experts.sfm import frames, photos, work
@@ -195,6 +196,7 @@ def describe_request(
         "max_side": options.max_side,
         "camera_model": options.camera_model,
         "mapper": options.mapper,
+        "stretched": STRETCHED,
         "seed": options.seed,
     }
 

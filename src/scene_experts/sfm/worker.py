@@ -24,7 +24,6 @@ PAIRS = 200  # pairs per progress message during matching
 ENOUGH = 0.9  # fraction of photographs with a pose at which the second mapper is not tried
 FEW_FITTING = 4  # other photographs that fit one
 GROWN = 1.3  # times as many photographs or points as at the last adjustment of all poses, from which on they are adjusted anew
-STRETCHED = 1.1  # ratio of a lens's two focal lengths from which on they are no lens's
 WORSE = 1.1  # times the error of two focal lengths up to which one fits as well
 NEAR = 0.9  # share of the angle of a first pair from which COLMAP may find it
 FEW_FEATURES = 200  # a sharp photograph has thousands
@@ -273,21 +272,32 @@ def estimate_poses(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
 
 
 def estimate_all(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
-    """Estimate the poses, and again with one focal length where a camera was found to have two that
-    no lens has: a drone's pictures from one height do not tell them apart, and the scene is then
-    stretched. The second result is kept where it has as many poses and fits as well.
+    """Estimate the poses, and again with one focal length for lenses that were found to have two that
+    no lens has, if they took most photographs: a drone's pictures from one height do not tell the
+    two apart, and the scene is then stretched. The second result is kept where it has as many poses
+    and fits as well.
 
     It is that of the global mapper: the incremental one does not begin where pictures are nearly
     parallel projections.
     """
     result = estimate_poses(colmap, ask)
-    ratio = max((find_stretch(camera) for camera in result.get("cameras", [])), default=1.0)
-    if ratio < STRETCHED:
+    if not result["registered"]:
         return result
-    report(step="stretched", ratio=ratio)
-    shorter = min(min(camera["params"][:2]) / camera["width"] for camera in result["cameras"])
-    use_one_focal_length(colmap, ask["database"], shorter)
-    again = {**ask, "maps": ask["maps"] + "/one", "model": ask["maps"] + "/one-model", "mapper": "global"}
+    model = colmap.Reconstruction(ask["model"])
+    lenses = {i: sorted(camera.params[:2]) for i, camera in model.cameras.items() if camera.model.name == "OPENCV"}
+    stretched = {i: short for i, (short, long) in lenses.items() if long >= ask["stretched"] * short > 0}
+    if 2 * sum(image.camera_id in stretched for image in model.images.values()) <= len(model.images):
+        return result
+    report(step="stretched", ratio=max(lenses[i][1] / lenses[i][0] for i in stretched))
+    again = {
+        **ask,
+        "database": ask["database"] + ".one",
+        "maps": ask["maps"] + "/one",
+        "model": ask["maps"] + "/one-model",
+        "mapper": "global",
+    }
+    shutil.copyfile(ask["database"], again["database"])  # a call that is killed goes on with the lenses that were asked for
+    use_one_focal_length(colmap, again["database"], stretched)
     other = estimate_poses(colmap, again)
     kept = len(other["registered"]) >= len(result["registered"]) and other["error"] <= WORSE * result["error"]
     report(step="one focal length", kept=kept)
@@ -298,23 +308,16 @@ def estimate_all(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
     return {**other, "mappers": {**result["mappers"], **other["mappers"]}, "lacking": result["lacking"], "one_focal_length": True}
 
 
-def find_stretch(camera: dict[str, Any]) -> float:
-    """Return the ratio of the larger focal length of a camera to the smaller one."""
-    if camera["model"] not in ("OPENCV", "PINHOLE", "FULL_OPENCV", "OPENCV_FISHEYE"):
-        return 1.0
-    one, other = camera["params"][:2]
-    return max(one, other) / max(min(one, other), 1e-9)
-
-
-def use_one_focal_length(colmap: Any, database: str, share: float) -> None:
-    """Give every camera of the database a lens with one focal length, `share` of the width to begin
-    with, and two radial terms."""
+def use_one_focal_length(colmap: Any, database: str, focal: dict[int, float]) -> None:
+    """Give cameras of the database a lens with one focal length, in pixels by camera to begin with,
+    and two radial terms."""
     with colmap.Database.open(database) as there:
         for camera in there.read_all_cameras():
-            params = [share * camera.width, camera.width / 2, camera.height / 2, 0.0, 0.0]
-            new = colmap.Camera(camera_id=camera.camera_id, model="RADIAL", width=camera.width, height=camera.height, params=params)
-            new.has_prior_focal_length = camera.has_prior_focal_length
-            there.update_camera(new)
+            if camera.camera_id in focal:
+                params = [focal[camera.camera_id], camera.width / 2, camera.height / 2, 0.0, 0.0]
+                new = colmap.Camera(camera_id=camera.camera_id, model="RADIAL", width=camera.width, height=camera.height, params=params)
+                new.has_prior_focal_length = camera.has_prior_focal_length
+                there.update_camera(new)
 
 
 def registered_names(model: Any) -> set[str]:

@@ -15,7 +15,7 @@ from PIL import Image
 
 from scene_experts.core.errors import InputError
 from scene_experts.data.images import FrameSource, decode
-from scene_experts.data.lens import COLMAP_MODELS, MODELS, PANORAMA, Lens, centre_principal_point, tell_stretched, to_pinhole
+from scene_experts.data.lens import COLMAP_MODELS, MODELS, PANORAMA, Lens, centre_principal_point, to_pinhole
 from support.lenses import IDS, LENSES
 
 # This code runs without the project, which must not be imported in a process with pycolmap.
@@ -216,8 +216,3 @@ def test_the_shortest_focal_length_overflows_nothing(model):
     to_pinhole(Lens(model, 16, 16, tuple(params)))
     with pytest.raises(InputError):
         Lens(model, 16, 16, (1e-15, *params[1:]))
-
-
-def test_focal_lengths_that_no_lens_has_are_told() -> None:
-    assert not tell_stretched([]) and not tell_stretched([(500.0, 500.0), (800.0, 850.0)])
-    assert "834 and 2,109 px" in tell_stretched([(500.0, 500.0), (834.2, 2109.0)])[0]

@@ -153,3 +153,8 @@ def test_no_step_changes_its_argument(capture: Capture) -> None:
     ):
         step(capture)
         assert same(capture, before)
+
+
+def test_focal_lengths_that_no_lens_has_are_told() -> None:
+    assert not prepare.tell_stretched([]) and not prepare.tell_stretched([(500.0, 500.0), (800.0, 850.0)])
+    assert "834 and 2,109 px" in prepare.tell_stretched([(500.0, 500.0), (834.2, 2109.0)])[0]

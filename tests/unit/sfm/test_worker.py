@@ -288,44 +288,46 @@ def test_the_first_pair_is_searched_with_half_of_the_angle_where_no_pair_has_all
 
 
 @pytest.mark.parametrize(
-    ("lenses", "posed", "errors", "kept"),
+    ("cameras", "posed", "errors", "kept"),
     [
-        ([(834.2, 2109.0), (900.0,)], (5, 5), (0.31, 0.33), True),
-        ([(834.2, 2109.0), (900.0,)], (5, 4), (0.31, 0.33), False),  # fewer photographs fit
-        ([(600.0, 800.0), (700.0,)], (5, 5), (0.4, 1.9), False),  # the pixels are no squares
-        ([(600.0, 610.0)], (5,), (0.4,), None),
+        ([1] * 5, (5, 5), (0.31, 0.33), True),
+        ([1, 1, 1, 2, 2], (5, 5), (0.31, 0.33), True),  # the other lens stays as it is
+        ([1] * 5, (5, 4), (0.31, 0.33), False),  # fewer photographs fit
+        ([1] * 5, (5, 5), (0.4, 1.9), False),  # the pixels are no squares
+        ([1, 2, 2, 2, 2], (5,), (0.4,), None),  # one photograph says little of its lens
+        ([2] * 5, (5,), (0.4,), None),
+        ([], (0,), (0.0,), None),
     ],
 )
-def test_a_lens_with_two_focal_lengths_is_sought_again_with_one(tmp_path, monkeypatch, capsys, lenses, posed, errors, kept):
-    asked, camera = [], SimpleNamespace(camera_id=3, width=288, height=360, has_prior_focal_length=False)
-    updated = []
+def test_a_lens_with_two_focal_lengths_is_sought_again_with_one(tmp_path, monkeypatch, capsys, cameras, posed, errors, kept):
+    """Camera 1 has two focal lengths, camera 2 has two that are nearly one; `cameras` are those of the photographs."""
+    asked, updated = [], []
+    lenses = {1: (2109.0, 834.2), 2: (600.0, 610.0)}
 
     def estimate(colmap, ask):
         i = len(asked)
         asked.append(ask)
         Path(ask["model"]).mkdir(parents=True)
         (Path(ask["model"]) / "cameras.bin").write_text(str(i))
-        lens = {"width": 288, "model": "OPENCV" if len(lenses[i]) == 2 else "RADIAL", "params": [*lenses[i], 144.0, 180.0]}
-        return {
-            "registered": ["a"] * posed[i],
-            "lacking": [],
-            "mapper": "incremental",
-            "mappers": {},
-            "error": errors[i],
-            "cameras": [lens],
-        }
+        return {"registered": ["a"] * posed[i], "lacking": [], "mapper": "incremental", "mappers": {}, "error": errors[i]}
 
     @contextmanager
     def open_database(path):
-        yield SimpleNamespace(read_all_cameras=lambda: [camera], update_camera=updated.append)
+        there = [SimpleNamespace(camera_id=i, width=288, height=360, has_prior_focal_length=False) for i in lenses]
+        yield SimpleNamespace(read_all_cameras=lambda: there, update_camera=updated.append)
 
-    colmap = SimpleNamespace(Camera=SimpleNamespace, Database=SimpleNamespace(open=open_database))
+    def read_model(folder):
+        found = {i: SimpleNamespace(model=SimpleNamespace(name="OPENCV"), params=[*lenses[i], 144.0, 180.0]) for i in lenses}
+        return SimpleNamespace(cameras=found, images={i: SimpleNamespace(camera_id=camera) for i, camera in enumerate(cameras)})
+
+    colmap = SimpleNamespace(Camera=SimpleNamespace, Database=SimpleNamespace(open=open_database), Reconstruction=read_model)
     monkeypatch.setattr(worker, "estimate_poses", estimate)
-    ask = {"maps": str(tmp_path / "maps"), "model": str(tmp_path / "model"), "database": "", "mapper": "auto"}
-    found = worker.estimate_all(colmap, ask)
-    assert len(asked) == len(lenses) and (tmp_path / "model" / "cameras.bin").read_text() == ("1" if kept else "0")
-    assert found["cameras"][0]["model"] == ("RADIAL" if kept else "OPENCV") and [path.name for path in tmp_path.glob("mo*")] == ["model"]
+    (tmp_path / "db").touch()
+    names = {"maps": str(tmp_path / "maps"), "model": str(tmp_path / "model"), "database": str(tmp_path / "db")}
+    found = worker.estimate_all(colmap, {**names, "mapper": "auto", "stretched": 1.1})
+    assert len(asked) == len(posed) and (tmp_path / "model" / "cameras.bin").read_text() == ("1" if kept else "0")
+    assert found.get("one_focal_length", False) is bool(kept)
     if kept is not None:
-        assert asked[1]["mapper"] == "global" and updated[0].params == [min(lenses[0]), 144.0, 180.0, 0.0, 0.0]
-        assert updated[0].model == "RADIAL" and updated[0].camera_id == 3
+        assert asked[1]["mapper"] == "global" and asked[1]["database"] != asked[0]["database"]
+        assert [(new.camera_id, new.model, new.params) for new in updated] == [(1, "RADIAL", [834.2, 144.0, 180.0, 0.0, 0.0])]
         assert json.loads(capsys.readouterr().out.splitlines()[-1])["kept"] is kept
