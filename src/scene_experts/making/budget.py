@@ -20,9 +20,9 @@ trainings of 4,000 iterations on banana, brighton, fern and kitchen."""
 LOOK = 0.1  # share of the iterations after which the speed is known
 CLOSE = (0.8, 1.3)  # a training whose time will be this share of what it has is not begun anew
 LEAST, MOST, MOST_OF_FEW = 300, 30_000, 7_000  # iterations; the last with few photographs (`bench.advice.FEW`)
-FIRST_OF_FEW = 2_000
-"""Iterations of few photographs without --minutes: half of what `info` proposes. Twice as many gain 0.1 to
-0.3 dB and 5 to 8 % of LPIPS, and are three quarters of the whole time (results/to-page.md)."""
+FIRST = 0.5
+"""Share of the iterations that `info` proposes, without --minutes. Twice as many gain 0.1 to 0.6 dB and 5 to
+8 % of LPIPS, and are three quarters of the whole time (results/to-page.md)."""
 PAGE_GUESS, SCORES_GUESS = 20.0, 40.0  # seconds, before anything is known
 
 
@@ -76,16 +76,16 @@ class Whole:
 
 def plan_training(width: int, height: int, views: int, have: float | None, slow: float = 1.0) -> Advice:
     """Return a training for photographs of this size that takes `have` seconds; None: what `suggest`
-    proposes, with FIRST_OF_FEW iterations at most for few photographs.
+    proposes, with FIRST of its iterations.
 
     slow: How many times longer than estimated this machine takes.
     """
     limit = None if have is None else have / 60 / slow
     advice = suggest(width, height, views, limit=limit)
-    if advice.minutes is None or (limit is None and views > FEW):
+    if advice.minutes is None:
         return advice
     if limit is None:
-        iterations = min(advice.iterations, FIRST_OF_FEW)
+        iterations = round(FIRST * advice.iterations)
     else:
         iterations = min(max(round(advice.iterations * limit / advice.minutes), LEAST), MOST_OF_FEW if views <= FEW else MOST)
     return replace(advice, iterations=iterations, minutes=advice.minutes * iterations / advice.iterations)

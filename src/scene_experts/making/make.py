@@ -81,8 +81,7 @@ def make(
         source: Folder of photographs, a video, or a capture.
         out: Folder to write. Default: the name of the source with "-scene", in this folder.
         minutes: Time for the whole, above 0. It decides iterations, resolution and effort; poses
-            take what they take. Default: what `info` proposes, and for up to 30 photographs half
-            of its iterations.
+            take what they take. Default: what `info` proposes, with half of its iterations.
         scores: Hold out every 8th photograph of at least 12, and score it. Default: train on all.
         options: What the photographs or the video need: frames of a video, panoramas, matching.
         say: Called with each message.

@@ -71,12 +71,14 @@ def tell(message: dict[str, Any], say: Say, progress: Progress) -> None:
         apart = f" in the largest of {message['parts']} parts, which do not fit together" if message["parts"] > 1 else ""
         posed = f"gave {message['posed']} of {message['photographs']} photographs a pose{apart}"
         say(f"the {message['mapper']} mapper {posed}; the global mapper runs too, and the better result is kept")
+    elif step == "narrow":
+        say("no two pictures show the same points from clearly different directions: one focal length and the global mapper come first")
     elif step == "stretched":
         say(f"COLMAP found a lens with two focal lengths, one {message['ratio']:.2f} times the other: it is sought again with one")
     elif step == "one focal length":
         fits = "one focal length fits as well and is kept"
         stays = "warning: one focal length does not fit as well, so two are kept; if no lens stretched the pictures, the scene is stretched"
-        say(fits if message["kept"] else stays)
+        say(fits if message["kept"] else "they do not fit: two focal lengths are tried, too" if message["first"] else stays)
     elif step == "weak":
         say(f"{message['photographs']} photographs fit too few others; {message['pairs']:,} more pairs are matched for them")
     elif step == "unread":

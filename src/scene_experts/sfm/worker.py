@@ -25,6 +25,7 @@ ENOUGH = 0.9  # fraction of photographs with a pose at which the second mapper i
 FEW_FITTING = 4  # other photographs that fit one
 GROWN = 1.3  # times as many photographs or points as at the last adjustment of all poses, from which on they are adjusted anew
 WORSE = 1.1  # times the error of two focal lengths up to which one fits as well
+FITS = 1.0  # pixels of error up to which one is kept where two were not tried
 NEAR = 0.9  # share of the angle of a first pair from which COLMAP may find it
 FEW_FEATURES = 200  # a sharp photograph has thousands
 PROBED = 8  # photographs of a camera from which on two of them show whether the smallest features are needed
@@ -272,14 +273,24 @@ def estimate_poses(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
 
 
 def estimate_all(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
-    """Estimate the poses, and again with one focal length for lenses that were found to have two that
-    no lens has, if they took most photographs: a drone's pictures from one height do not tell the
-    two apart, and the scene is then stretched. The second result is kept where it has as many poses
-    and fits as well.
+    """Estimate the poses, with one focal length where the pictures do not tell two apart: first, where
+    no pair of photographs has a wide angle (ask["narrow"]); else for lenses that were found to have
+    two that no lens has, if they took most photographs. Such are a drone's pictures from one height:
+    with two focal lengths the scene may be stretched. The poses with one are kept where they are as
+    many and fit as well.
 
-    It is that of the global mapper: the incremental one does not begin where pictures are nearly
-    parallel projections.
+    They are those of the global mapper: the incremental one does not begin where pictures are nearly
+    parallel projections, or takes three times as long.
     """
+    one: dict[str, Any] | None = None
+    if ask["narrow"] and ask["mapper"] == "auto":
+        report(step="narrow")
+        with colmap.Database.open(ask["database"]) as there:
+            guessed = {camera.camera_id: min(camera.params[:2]) for camera in there.read_all_cameras() if camera.model.name == "OPENCV"}
+        one = estimate_with_one(colmap, ask, guessed)
+        if len(one["registered"]) >= ENOUGH * sum(map(len, ask["groups"])) and one["error"] <= FITS:
+            return keep_one(ask, one)
+        report(step="one focal length", kept=False, first=True)
     result = estimate_poses(colmap, ask)
     if not result["registered"]:
         return result
@@ -288,7 +299,17 @@ def estimate_all(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
     stretched = {i: short for i, (short, long) in lenses.items() if long >= ask["stretched"] * short > 0}
     if 2 * sum(image.camera_id in stretched for image in model.images.values()) <= len(model.images):
         return result
-    report(step="stretched", ratio=max(lenses[i][1] / lenses[i][0] for i in stretched))
+    if one is None:
+        report(step="stretched", ratio=max(lenses[i][1] / lenses[i][0] for i in stretched))
+        one = estimate_with_one(colmap, ask, stretched)
+    kept = len(one["registered"]) >= len(result["registered"]) and one["error"] <= WORSE * result["error"]
+    report(step="one focal length", kept=kept, first=False)
+    return keep_one(ask, {**one, "mappers": {**result["mappers"], **one["mappers"]}, "lacking": result["lacking"]}) if kept else result
+
+
+def estimate_with_one(colmap: Any, ask: dict[str, Any], focal: dict[int, float]) -> dict[str, Any]:
+    """Estimate the poses by the global mapper, with one focal length for these cameras. The model is in
+    the folder of maps."""
     again = {
         **ask,
         "database": ask["database"] + ".one",
@@ -297,15 +318,15 @@ def estimate_all(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
         "mapper": "global",
     }
     shutil.copyfile(ask["database"], again["database"])  # a call that is killed goes on with the lenses that were asked for
-    use_one_focal_length(colmap, again["database"], stretched)
-    other = estimate_poses(colmap, again)
-    kept = len(other["registered"]) >= len(result["registered"]) and other["error"] <= WORSE * result["error"]
-    report(step="one focal length", kept=kept)
-    if not kept:
-        return result
-    shutil.rmtree(ask["model"])
-    os.rename(again["model"], ask["model"])
-    return {**other, "mappers": {**result["mappers"], **other["mappers"]}, "lacking": result["lacking"], "one_focal_length": True}
+    use_one_focal_length(colmap, again["database"], focal)
+    return estimate_poses(colmap, again)
+
+
+def keep_one(ask: dict[str, Any], one: dict[str, Any]) -> dict[str, Any]:
+    """Put the model with one focal length into the place of the other, if there is one."""
+    shutil.rmtree(ask["model"], ignore_errors=True)
+    os.rename(ask["maps"] + "/one-model", ask["model"])
+    return {**one, "one_focal_length": True}
 
 
 def use_one_focal_length(colmap: Any, database: str, focal: dict[int, float]) -> None:
@@ -370,7 +391,7 @@ def map_incrementally(colmap: Any, ask: dict[str, Any], out: str, total: int) ->
     if ask["rig"] is not None:
         options.ba_refine_sensor_from_rig = False
         options.constant_cameras = find_cut_cameras(colmap, ask)
-    elif not has_wide_pair(colmap, ask, options.mapper):  # the first pair is the one that COLMAP's third search would find
+    elif ask["narrow"]:  # the first pair is the one that COLMAP's third search would find
         options.mapper.init_min_num_inliers //= 2
         options.mapper.init_min_tri_angle /= 2
 
@@ -388,12 +409,13 @@ def map_incrementally(colmap: Any, ask: dict[str, Any], out: str, total: int) ->
     return colmap.incremental_mapping(ask["database"], ask["images"], out, options=options, **calls)
 
 
-def has_wide_pair(colmap: Any, ask: dict[str, Any], wanted: Any) -> bool:
+def has_wide_pair(colmap: Any, ask: dict[str, Any]) -> bool:
     """Return whether a pair of photographs may have the angle that COLMAP wants of the first pair.
 
     COLMAP searches all pairs for one, 30 ms each, then again with half of the inliers, then with
     half of the angle. The frames of a video often have none. A pair takes 1 ms here.
     """
+    wanted = colmap.IncrementalPipelineOptions().mapper
     with colmap.Database.open(ask["database"]) as there:
         images = {image.image_id: image for image in there.read_all_images()}
         cameras = {camera.camera_id: camera for camera in there.read_all_cameras()}
@@ -462,6 +484,7 @@ def main() -> int:
         os._exit(0)
     if ask["rig"] is not None:
         tie_views(colmap, ask)
+    ask["narrow"] = ask["rig"] is None and ask["mapper"] != "global" and not has_wide_pair(colmap, ask)
     estimate = estimate_all if ask["camera_model"] == "OPENCV" and ask["rig"] is None else estimate_poses
     report(step="done", version=colmap.__version__, large_features=large, **estimate(colmap, ask))
     sys.stdout.flush()

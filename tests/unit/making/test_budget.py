@@ -4,7 +4,7 @@ import pytest
 
 from scene_experts.bench import advice
 from scene_experts.making.budget import (
-    FIRST_OF_FEW,
+    FIRST,
     GROWTH,
     LEAST,
     LEAST_PAGE,
@@ -49,10 +49,10 @@ def test_a_training_fills_the_time_that_it_has(monkeypatch):
     assert slow == plan_training(1200, 800, 40, 150.0)
     assert plan_training(1200, 800, 40, 0.0).iterations == LEAST and plan_training(1200, 800, 40, 1e9).iterations == MOST
     assert plan_training(1200, 800, 12, 1e9).iterations == MOST_OF_FEW
-    assert plan_training(1200, 800, 40, None) == advice.suggest(1200, 800, 40)
-    few, proposed = plan_training(1200, 800, 12, None), advice.suggest(1200, 800, 12)
-    assert few.iterations == FIRST_OF_FEW < proposed.iterations and few.side == proposed.side
-    assert few.minutes == pytest.approx(proposed.minutes * FIRST_OF_FEW / proposed.iterations)
+    for views in (12, 40):
+        first, proposed = plan_training(1200, 800, views, None), advice.suggest(1200, 800, views)
+        assert first.iterations == FIRST * proposed.iterations and first.side == proposed.side
+        assert first.minutes == pytest.approx(FIRST * proposed.minutes)
 
 
 def test_how_slow_the_machine_is_follows_from_the_first_iterations():

@@ -31,12 +31,15 @@ def test_each_message_of_the_worker_is_told():
         {"step": "weak", "photographs": 4, "pairs": 1200},
         {"step": "unread", "names": ["a.jpg", "b.jpg"]},
         {"step": "stretched", "ratio": 2.5282},
-        {"step": "one focal length", "kept": True},
-        {"step": "one focal length", "kept": False},
+        {"step": "one focal length", "kept": True, "first": False},
+        {"step": "one focal length", "kept": False, "first": False},
+        {"step": "narrow"},
+        {"step": "one focal length", "kept": False, "first": True},
         {"step": "done", "registered": []},
     ]
     for message in messages:
         colmap.tell(message, said.append, lambda *work: shown.append(work))
-    assert shown == [("features", 1, 3)] and len(said) == 7
+    assert shown == [("features", 1, 3)] and len(said) == 9
     assert "2 of 6" in said[1] and "2 parts" in said[1] and "1,200" in said[2] and "a.jpg, b.jpg" in said[3]
     assert "2.53 times" in said[4] and "is kept" in said[5] and "stretched" in said[6]
+    assert "different directions" in said[7] and "two focal lengths are tried" in said[8]

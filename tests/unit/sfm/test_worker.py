@@ -284,7 +284,8 @@ def test_the_first_pair_is_searched_with_half_of_the_angle_where_no_pair_has_all
         estimate_two_view_geometry_pose=estimate,
     )
     mapper = SimpleNamespace(init_min_num_inliers=100, init_min_tri_angle=16.0)
-    assert worker.has_wide_pair(colmap, {"database": ""}, mapper) is wide
+    colmap.IncrementalPipelineOptions = lambda: SimpleNamespace(mapper=mapper)
+    assert worker.has_wide_pair(colmap, {"database": ""}) is wide
 
 
 @pytest.mark.parametrize(
@@ -324,10 +325,55 @@ def test_a_lens_with_two_focal_lengths_is_sought_again_with_one(tmp_path, monkey
     monkeypatch.setattr(worker, "estimate_poses", estimate)
     (tmp_path / "db").touch()
     names = {"maps": str(tmp_path / "maps"), "model": str(tmp_path / "model"), "database": str(tmp_path / "db")}
-    found = worker.estimate_all(colmap, {**names, "mapper": "auto", "stretched": 1.1})
+    found = worker.estimate_all(colmap, {**names, "mapper": "auto", "stretched": 1.1, "narrow": False})
     assert len(asked) == len(posed) and (tmp_path / "model" / "cameras.bin").read_text() == ("1" if kept else "0")
     assert found.get("one_focal_length", False) is bool(kept)
     if kept is not None:
         assert asked[1]["mapper"] == "global" and asked[1]["database"] != asked[0]["database"]
         assert [(new.camera_id, new.model, new.params) for new in updated] == [(1, "RADIAL", [834.2, 144.0, 180.0, 0.0, 0.0])]
         assert json.loads(capsys.readouterr().out.splitlines()[-1])["kept"] is kept
+
+
+@pytest.mark.parametrize(
+    ("posed", "errors", "mapper", "ran"),
+    [
+        ((10,), (0.3,), "auto", [("one", True)]),
+        ((9,), (0.3,), "auto", [("one", True)]),
+        ((8, 10), (0.3, 0.3), "auto", [("one", False), ("two", True)]),  # too few fit
+        ((10, 10), (1.3, 1.2), "auto", [("one", True), ("two", False)]),  # two fit badly, too, and are stretched
+        ((10, 10), (1.3, 0.4), "auto", [("one", False), ("two", True)]),
+        ((10, 10), (0.3, 0.3), "incremental", [("two", False), ("one", True)]),  # that mapper was asked for: only its lens may change
+    ],
+)
+def test_one_focal_length_comes_first_where_no_pair_has_a_wide_angle(tmp_path, monkeypatch, capsys, posed, errors, mapper, ran):
+    asked = []
+
+    def estimate(colmap, ask):
+        i = len(asked)
+        asked.append("one" if ask["database"].endswith(".one") else "two")
+        assert ask["mapper"] == ("global" if asked[i] == "one" else mapper)
+        Path(ask["model"]).mkdir(parents=True)
+        (Path(ask["model"]) / "cameras.bin").write_text(asked[i])
+        return {"registered": ["a"] * posed[i], "lacking": [], "mappers": {asked[i]: posed[i]}, "error": errors[i]}
+
+    def read_model(folder):
+        lens = SimpleNamespace(model=SimpleNamespace(name="OPENCV"), params=[2109.0, 834.2, 144.0, 180.0])
+        return SimpleNamespace(cameras={1: lens}, images={i: SimpleNamespace(camera_id=1) for i in range(10)})
+
+    @contextmanager
+    def open_database(path):
+        cameras = [SimpleNamespace(camera_id=1, model=SimpleNamespace(name="OPENCV"), params=[432.0, 440.0], width=288, height=360)]
+        yield SimpleNamespace(read_all_cameras=lambda: cameras)
+
+    firsts = []
+    monkeypatch.setattr(worker, "estimate_poses", estimate)
+    monkeypatch.setattr(worker, "use_one_focal_length", lambda colmap, database, focal: firsts.append(focal))
+    (tmp_path / "db").touch()
+    names = {"maps": str(tmp_path / "maps"), "model": str(tmp_path / "model"), "database": str(tmp_path / "db")}
+    ask = {**names, "mapper": mapper, "stretched": 1.1, "narrow": True, "groups": [["a"] * 6, ["b"] * 4]}
+    colmap = SimpleNamespace(Database=SimpleNamespace(open=open_database), Reconstruction=read_model)
+    found = worker.estimate_all(colmap, ask)
+    assert asked == [name for name, _ in ran] and firsts == [{1: 432.0 if mapper == "auto" else 834.2}]
+    kept = next(name for name, stays in ran if stays)
+    assert found.get("one_focal_length", False) is (kept == "one") and (tmp_path / "model" / "cameras.bin").read_text() == kept
+    assert ('"narrow"' in capsys.readouterr().out) is (mapper == "auto")
