@@ -19,6 +19,7 @@ from typing import Any
 import scene_experts as se
 
 QUALITIES = (0.03, 0.1, 0.2, 0.4, 0.8)  # dB that training views may lose
+DEFAULT = 0.2
 STANDARD = ("sog", "spz", "compressed-ply")
 
 
@@ -44,30 +45,52 @@ def measure(run: se.Run, folder: Path, format: str, options: dict[str, float]) -
     }
 
 
+LINES = {  # recipe and format: name, colour, marker
+    ("one-network", "compact"): ("one-network, compact", "#0b5cad", "o"),
+    ("scaffold-gs", "compact"): ("Scaffold-GS, compact", "#d1730a", "s"),
+    ("3dgs-mcmc", "sog"): ("3DGS-MCMC, sog", "#777777", "^"),
+    ("3dgs-mcmc", "spz"): ("3DGS-MCMC, spz", "#aaaaaa", "v"),
+}
+
+
 def draw(rows: list[dict[str, Any]], place: Path) -> None:
-    """Draw PSNR and LPIPS over bytes, a column for each capture."""
+    """Draw PSNR and LPIPS over bytes, a column for each capture. Of runs with --rate only the file of
+    the default --quality is shown: they make a line together."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
-    from matplotlib.ticker import LogLocator, StrMethodFormatter
+    from matplotlib.ticker import FixedLocator, NullFormatter, StrMethodFormatter
 
-    captures = sorted({row["capture"] for row in rows})
-    figure, axes = pyplot.subplots(2, len(captures), figsize=(4 * len(captures), 6), squeeze=False, sharex="col")
+    matplotlib.rcParams["svg.hashsalt"] = "size"
+    captures = list(dict.fromkeys(row["capture"] for row in rows))
+    figure, axes = pyplot.subplots(2, len(captures), figsize=(2.6 * len(captures) + 0.6, 4.6), squeeze=False, sharex="col")
+    named = {}
     for column, capture in enumerate(captures):
-        mine = [row for row in rows if row["capture"] == capture]
-        for label in sorted({row["label"] for row in mine}):
-            line = sorted((row for row in mine if row["label"] == label), key=lambda row: row["bytes"])
-            for axis, score in zip(axes[:, column], ("psnr", "lpips")):
-                axis.plot([row["bytes"] / 1e6 for row in line], [row[score] for row in line], "o-", markersize=3, linewidth=1, label=label)
-        axes[0, column].set(title=capture, xscale="log", ylabel="PSNR, dB" if column == 0 else "")
-        axes[1, column].xaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
-        axes[1, column].xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axes[1, column].xaxis.set_minor_formatter("")
-        axes[1, column].set(xlabel="MB, all told", ylabel="LPIPS (VGG)" if column == 0 else "")
-    axes[0, 0].legend(fontsize=7)
-    figure.tight_layout()
-    figure.savefig(place)
+        for (recipe, format), (name, colour, marker) in LINES.items():
+            mine = [row for row in rows if (row["capture"], row["recipe"], row["format"]) == (capture, recipe, format)]
+            rated = [row for row in mine if row["rate"] and row["quality"] == DEFAULT]
+            plain = [row for row in mine if not row["rate"]]
+            for line, label, style in ((plain, name, "--" if rated else "-"), (rated, name + ", --rate", "-")):
+                line = sorted(line, key=lambda row: row["bytes"])
+                for axis, score in zip(axes[:, column], ("psnr", "lpips")) if line else ():
+                    x, y = [row["bytes"] / 1e6 for row in line], [row[score] for row in line]
+                    named[label] = axis.plot(x, y, style, color=colour, marker=marker, markersize=4, linewidth=1.5)[0]
+        axes[0, column].set_title(capture, fontsize=10)
+        for axis in axes[:, column]:
+            axis.set_xscale("log")
+            axis.grid(color="#e6e6e6", linewidth=0.6)
+            axis.xaxis.set_major_locator(FixedLocator([0.25, 0.5, 1, 2, 4, 8, 16]))
+            axis.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axis.xaxis.set_minor_formatter(NullFormatter())
+            axis.tick_params(labelsize=8)
+            axis.spines[["top", "right"]].set_visible(False)
+    axes[0, 0].set_ylabel("PSNR, dB", fontsize=9)
+    axes[1, 0].set_ylabel("LPIPS, less is better", fontsize=9)
+    figure.supxlabel("MB of the file, networks included", fontsize=9, y=0.1)
+    figure.legend(named.values(), named.keys(), loc="lower center", ncols=3, fontsize=8, frameon=False)
+    figure.tight_layout(rect=(0, 0.09, 1, 1))
+    figure.savefig(place, dpi=110, metadata={"Date": None} if place.suffix == ".svg" else None)
 
 
 def main() -> None:

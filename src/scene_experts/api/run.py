@@ -295,7 +295,8 @@ class Run:
             prune: Standard files: leave out the Gaussians that contribute least, up to this share
                 (0 to 1) of all contributions.
             refine: Standard files: iterations that fit the baked Gaussians to pictures of the run;
-                0 for none. Default: 200 to 1000, by how far they are from them.
+                0 for none. Default: 200 for up to 20 training views, else 200 to 1000,
+                by how far they are from them.
             frame: Standard files: the frame of the capture, or the trained world.
             crop: Standard files: keep what is inside "sphere:RADIUS" (around the point that the
                 cameras look at; "1.2x" counts in their distance from it), "sphere:X,Y,Z,RADIUS" or

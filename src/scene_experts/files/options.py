@@ -35,9 +35,9 @@ class Options:
     """Standard files: share of all contributions to the pictures to leave out, smallest first, 0 to
     below 1 (0.02 costs little)."""
     refine: int | None = None
-    """Standard files: iterations that fit all parameters to the run's pictures; by default 200 to
-    1000, by how far the means over the views are from them. 0 keeps the means, which takes
-    seconds."""
+    """Standard files: iterations that fit all parameters to the run's pictures; by default 200
+    for up to 20 training views, else 200 to 1000, by how far the means over the views are from
+    them. 0 keeps the means, which takes seconds."""
     frame: Literal["capture", "trained"] = "capture"
     """Standard files: the capture's own frame, or the frame that the scene was trained in."""
     crop: Annotated[str | None, Option(value="SHAPE")] = None

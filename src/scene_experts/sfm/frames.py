@@ -1,11 +1,10 @@
-"""Extracts the sharpest frames of a video, spread evenly over its length, with the ffmpeg that
+"""Extracts the sharpest frames of a video, spread evenly over its motion, with the ffmpeg that
 imageio installs."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,20 +18,26 @@ from scene_experts.core.progress import Progress
 
 GRADING_WIDTH = 480  # px; frames are scaled to this width before their sharpness is measured
 JPEG_QUALITY = 95
+STILL = 0.1  # share of the usual change from frame to frame below which a frame is a copy of the one before
 
 
-def extract_frames(video: Path, folder: Path, count: int, progress: Progress) -> list[str]:
-    """Write about `count` frames of `video` into `folder` as frame_00001.jpg, ... and return their
-    names.
+def extract_frames(video: Path, folder: Path, count: int, progress: Progress) -> tuple[list[str], int]:
+    """Write about `count` frames of `video` into `folder` as frame_00001.jpg, ...; returns their names
+    and how many frames show no motion.
 
-    The video is divided into `count` segments of equal length, and the sharpest frame of each is
+    The video is divided into `count` segments of equal motion, and the sharpest frame of each is
     extracted. Raises InputError if imageio-ffmpeg is missing or ffmpeg cannot decode the file.
     """
-    grades, expected, frames = [], *read_frames(video, f"scale={GRADING_WIDTH}:-2,format=gray", "gray", 1)
+    grades, changes, before = [], [], None
+    expected, frames = read_frames(video, f"scale={GRADING_WIDTH}:-2,format=gray", "gray", 1)
     for frame in frames:
-        grades.append(sharpness(frame[..., 0]))
+        gray = frame[..., 0].astype(np.float32)
+        grades.append(sharpness(gray))
+        changes.append(0.0 if before is None else float(np.abs(gray - before).mean()))
+        before = gray
         progress("looking for sharp frames", len(grades), max(expected, len(grades)))
-    chosen = choose_sharpest(grades, count)
+    motion = measure_motion(changes)
+    chosen = choose_sharpest(grades, motion, count)
     if not chosen:
         raise InputError(f"expected a video with frames at {video}, found none; convert it to mp4 or extract its frames with another tool")
     names = [f"frame_{i + 1:05d}.jpg" for i in range(len(chosen))]
@@ -41,7 +46,7 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
         image = Image.fromarray(frame)
         write_atomic(folder / name, lambda temporary, image=image: image.save(temporary, "JPEG", quality=JPEG_QUALITY, subsampling=0))
         progress("frames", i + 1, len(names))
-    return names
+    return names, motion.count(0.0)
 
 
 def select_frames(numbers: Sequence[int]) -> str:
@@ -53,11 +58,32 @@ def select_frames(numbers: Sequence[int]) -> str:
     return f"({select_frames(numbers[:middle])}+{select_frames(numbers[middle:])})"
 
 
-def choose_sharpest(grades: Sequence[float], count: int) -> list[int]:
-    """Return the index of the highest grade in each of `count` segments of equal length, or every
-    index if there are fewer."""
-    edges = np.linspace(0, len(grades), min(count, len(grades)) + 1).round().astype(int)
-    return [int(a + np.argmax(grades[a:b])) for a, b in pairwise(edges)]
+def measure_motion(changes: Sequence[float]) -> list[float]:
+    """Return how much the camera moves from the frame before to each frame, from 0 (not at all) to 1
+    (as usual in this video, or more).
+
+    changes: Mean absolute differences of each frame from the one before; the first counts as usual.
+    """
+    usual = float(np.quantile(changes[1:], 0.75)) if len(changes) > 1 else 0.0
+    shares = [min(1.0, change / usual) if usual > 0 else 1.0 for change in changes[1:]]
+    return [1.0, *(share if share >= STILL else 0.0 for share in shares)][: len(changes)]
+
+
+def choose_sharpest(grades: Sequence[float], motion: Sequence[float], count: int) -> list[int]:
+    """Return the index of the highest grade in each of `count` segments of equal motion, or every
+    index with motion if there are fewer."""
+    moved = [i for i, share in enumerate(motion) if share > 0]
+    if len(moved) <= count:
+        return moved
+    weight = np.asarray(motion)[moved]
+    while weight.max() > 1.0001 * weight.sum() / count:  # no frame may be longer than a segment
+        weight = np.minimum(weight, weight.sum() / count)
+    segments = ((weight.cumsum() - weight / 2) / weight.sum() * count).astype(int)
+    best: dict[int, int] = {}
+    for i, segment in zip(moved, segments.tolist()):
+        if segment not in best or grades[i] > grades[best[segment]]:
+            best[segment] = i
+    return list(best.values())
 
 
 def sharpness(gray: np.ndarray) -> float:

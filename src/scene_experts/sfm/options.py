@@ -22,8 +22,8 @@ class SourceOptions:
     """What the photographs or the video need: the settings that `capture` and `make` share."""
 
     frames: Annotated[int, Range(3, MOST_FRAMES)] = 150
-    """Number of frames to extract from a video. The sharpest frame of each of this many equal
-    segments is used."""
+    """Number of frames to extract from a video. The sharpest frame of each of this many segments of
+    equal motion is used, and none that shows the same as the one before."""
     matching: Matching = "auto"
     """Which photographs are matched. exhaustive: all pairs. sequential: neighbours in the order of
     their names, as for a walk. auto: all pairs of up to 30 photographs; of more, each with those

@@ -134,7 +134,7 @@ def take_frames(video: Path, folder: Path, images: Path, options: SfmOptions, sa
     out of them."""
     say(f"reading {video.name}: the sharpest of its frames are used")
     place = folder / FRAMES if (folder / FRAMES).is_dir() else images
-    found = extract_photos(video, place, options, progress)
+    found = extract_photos(video, place, options, say, progress)
     if place == images and cuts(found, options):  # the frames are not the photographs of the capture
         os.replace(images, folder / FRAMES)
         os.replace(images.with_name(VIDEO), folder / VIDEO)
@@ -294,7 +294,7 @@ def check_request(source: Path, out: Path, overwrite: bool) -> None:
         raise InputError(f"{out / 'images'} holds images that `capture` did not copy there; choose another --out")
 
 
-def extract_photos(video: Path, images: Path, options: SfmOptions, progress: Progress) -> list[Photo]:
+def extract_photos(video: Path, images: Path, options: SfmOptions, say: Say, progress: Progress) -> list[Photo]:
     """Extract the frames of a video into `images` and return them. Frames of an earlier call with
     the same video are reused."""
     note, mark = images.with_name(VIDEO), f"{video.name} {video.stat().st_size} {video.stat().st_mtime_ns} {options.frames}"
@@ -302,7 +302,9 @@ def extract_photos(video: Path, images: Path, options: SfmOptions, progress: Pro
         work.remove(images)
         for old in (note, images.with_name(photos.COPIED)):
             old.unlink(missing_ok=True)
-        names = frames.extract_frames(video, images, options.frames, progress)
+        names, still = frames.extract_frames(video, images, options.frames, progress)
+        if still:
+            say(f"{still} frames show the same as the one before and are left out")
         if len(names) < photos.FEWEST:
             raise InputError(f"expected a video of at least {photos.FEWEST} frames at {video}, found {len(names)}; use a longer video")
         note.write_text(mark)

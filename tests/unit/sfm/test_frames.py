@@ -9,8 +9,19 @@ from scene_experts.sfm import frames
 
 
 def test_one_frame_of_each_segment_is_chosen():
-    assert frames.choose_sharpest([1, 3, 2, 9, 8, 7, 0, 0, 5], 3) == [1, 3, 8]
-    assert frames.choose_sharpest([1.0, 2.0], 5) == [0, 1] and frames.choose_sharpest([], 5) == []
+    assert frames.choose_sharpest([1, 3, 2, 9, 8, 7, 0, 0, 5], [1.0] * 9, 3) == [1, 3, 8]
+    assert frames.choose_sharpest([1.0, 2.0], [1.0, 1.0], 5) == [0, 1] and frames.choose_sharpest([], [], 5) == []
+
+
+def test_copies_are_left_out_and_slow_parts_get_fewer_frames():
+    changes = [0.0, 4.0, 0.1, 4.4, 4.0, 0.0, 0.2, 4.0, 9.0, 4.0, 4.0]
+    motion = frames.measure_motion(changes)
+    assert [i for i, share in enumerate(motion) if not share] == [2, 5, 6] and max(motion) == 1.0 == motion[0]
+    assert frames.choose_sharpest([9.0] * 11, motion, 20) == [0, 1, 3, 4, 7, 8, 9, 10]
+    slow = [1.0] * 20 + [0.25] * 40  # as much motion in the first 20 frames as in twice the other 40
+    chosen = frames.choose_sharpest([1.0] * 60, slow, 9)
+    assert len(chosen) == 9 and sum(i < 20 for i in chosen) == 6
+    assert frames.measure_motion([0.0]) == [1.0] and frames.measure_motion([]) == [] and frames.measure_motion([0.0, 0.0]) == [1.0, 1.0]
 
 
 def test_blur_lowers_the_sharpness():
@@ -30,8 +41,8 @@ def test_the_sharp_frames_of_a_video_are_extracted_in_order(tmp_path):
             stream.send(np.ascontiguousarray(noise.filter(ImageFilter.GaussianBlur(blur))))
     stream.close()
     said = []
-    names = frames.extract_frames(tmp_path / "walk.mp4", tmp_path / "out", 3, lambda *a: said.append(a))
-    assert names == ["frame_00001.jpg", "frame_00002.jpg", "frame_00003.jpg"] and said[-1] == ("frames", 3, 3)
+    names, still = frames.extract_frames(tmp_path / "walk.mp4", tmp_path / "out", 3, lambda *a: said.append(a))
+    assert still == 0 and names == ["frame_00001.jpg", "frame_00002.jpg", "frame_00003.jpg"] and said[-1] == ("frames", 3, 3)
     pictures = [np.asarray(Image.open(tmp_path / "out" / name)).astype(float) for name in names]
     assert [p.shape for p in pictures] == [(64, 96, 3)] * 3
     assert np.allclose([p.mean() for p in pictures], [40, 120, 200], atol=6) and min(p.std() for p in pictures) > 8
@@ -43,9 +54,9 @@ def test_more_frames_than_an_expression_of_ffmpeg_may_be_deep(tmp_path):
     stream = ffmpeg.write_frames(str(tmp_path / "long.mp4"), (16, 16), fps=10, macro_block_size=2)
     stream.send(None)
     for shade in range(130):
-        stream.send(np.full((16, 16, 3), shade, np.uint8))
+        stream.send(np.full((16, 16, 3), 20 + 90 * (shade % 2) + shade, np.uint8))
     stream.close()
-    names = frames.extract_frames(tmp_path / "long.mp4", tmp_path / "out", 120, lambda *_: None)
+    names, _ = frames.extract_frames(tmp_path / "long.mp4", tmp_path / "out", 120, lambda *_: None)
     assert len(names) == len(list((tmp_path / "out").glob("*.jpg"))) == 120
 
 

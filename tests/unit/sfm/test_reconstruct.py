@@ -144,7 +144,7 @@ def test_frames_of_a_video_are_extracted_once(tmp_path, monkeypatch):
     def take(video, folder, count, progress):
         taken.append(count)
         write_black(folder, count)
-        return list(range(count))
+        return list(range(count)), 7
 
     monkeypatch.setattr(run.frames, "extract_frames", take)
     video = tmp_path / "walk.mp4"
@@ -161,7 +161,7 @@ def test_photographs_and_frames_are_not_taken_for_each_other(tmp_path, monkeypat
     def take(video, folder, count, progress):
         for i in range(count):
             write_photo(folder / f"{i}.jpg", size=(80, 60))
-        return list(range(count))
+        return list(range(count)), 0
 
     monkeypatch.setattr(run.frames, "extract_frames", take)
     video, source, images = tmp_path / "walk.mp4", write_black(tmp_path / "photos"), tmp_path / "out" / NAME / "done/images"

@@ -21,15 +21,18 @@ from scene_experts.training.photometric import photometric
 
 LEAST, MOST = 200, 1000  # iterations
 LOOKS = 8  # views that decide between them
+FEW = 20  # training views up to which LEAST iterations are enough (results/export.md)
 CLOSE, FAR = 41.0, 34.0
 """PSNR, dB, before the refinement of scenes for which LEAST and MOST iterations are enough: banana
 (41.1) loses nothing with 200; fox (33.6) loses 0.64 dB on held-out views with 200 and 0.15 with
 1,000."""
 
 
-def iterations_for(psnr: float) -> int:
-    """Return the iterations for a scene whose pictures have this PSNR, dB, to those they should
-    be."""
+def iterations_for(psnr: float, views: int) -> int:
+    """Return the iterations for a scene with this number of training views whose pictures have this
+    PSNR, dB, to those they should be."""
+    if views <= FEW:
+        return LEAST
     share = min(max((CLOSE - psnr) / (CLOSE - FAR), 0.0), 1.0)
     return round(LEAST + share * (MOST - LEAST))
 
@@ -40,7 +43,7 @@ class Refine:
     rate of means is multiplied by the extent."""
 
     iterations: int | None = None
-    """None: from LEAST to MOST, by how far the scene is from the pictures (`iterations_for`)."""
+    """None: LEAST for few views, else up to MOST, by how far the scene is from the pictures."""
     free: float = 0.6
     """Share of iterations that use free views."""
     dssim: float = 0.2
@@ -69,7 +72,7 @@ def refine(
     """
     iterations = how.iterations
     if iterations is None:
-        iterations = iterations_for(compare(scene, painter, views, background))
+        iterations = iterations_for(compare(scene, painter, views, background), len(views))
     rasterize, generator = painter.rasterize, torch.Generator().manual_seed(seed)
     groups = scene.rate_groups().items()
     optimizer = FusedAdam([{"params": params, "name": name, "lr": 0.0} for name, params in groups])

@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 
 from scene_experts.core.types import Mode
-from scene_experts.files.bake.refine import CLOSE, FAR, LEAST, MOST, Refine, compare, iterations_for, refine
+from scene_experts.files.bake.refine import CLOSE, FAR, FEW, LEAST, MOST, Refine, compare, iterations_for, refine
 from scene_experts.files.bake.views import Views
 from scene_experts.files.gaussians.read import DRAWN_AT, scene_of
 from scene_experts.files.measure import Painter
@@ -47,5 +47,6 @@ def test_disturbed_gaussians_draw_the_same_picture_again(tmp_path):
 
 
 def test_the_iterations_follow_from_how_far_the_scene_is():
-    assert [iterations_for(psnr) for psnr in (60.0, CLOSE, FAR, 10.0)] == [LEAST, LEAST, MOST, MOST]
-    assert iterations_for((CLOSE + FAR) / 2) == (LEAST + MOST) // 2
+    assert [iterations_for(psnr, FEW + 1) for psnr in (60.0, CLOSE, FAR, 10.0)] == [LEAST, LEAST, MOST, MOST]
+    assert iterations_for(FAR, FEW) == LEAST
+    assert iterations_for((CLOSE + FAR) / 2, 40) == (LEAST + MOST) // 2
