@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.errors import InputError
 from scene_experts.core.extras import install_line
 from scene_experts.core.io import read_json, write_bytes, write_json
 from scene_experts.core.progress import Progress
@@ -25,6 +25,7 @@ from scene_experts.data.prepare import STRETCHED
 from scene_experts.data.readers import is_capture
 from scene_experts.native import library as native
 from scene_experts.sfm import frames, photos, work
+from scene_experts.sfm.attempts import find_poses, warn_of_mapper
 from scene_experts.sfm.colmap import Say, run_worker
 from scene_experts.sfm.drift import KEY, NOTE, measure_drift
 from scene_experts.sfm.learned import attempt
@@ -34,7 +35,6 @@ from scene_experts.sfm.options import SfmOptions
 from scene_experts.sfm.pairs import choose_pairs, find_alike
 from scene_experts.sfm.panoramas import PanoramaRig, choose_held_out, cuts, take_photos
 from scene_experts.sfm.photos import Photo
-from scene_experts.sfm.worker import ENOUGH
 
 LOG, VIDEO, FRAMES = "colmap.log", "video.txt", "frames"
 TEST = "test.txt"  # lists the views that a training holds out
@@ -103,7 +103,8 @@ def reconstruct(
             asked = {"pairs": pairs, "spare": spare}
             request = {**request, **{name: [(names[i], names[j]) for i, j in some] for name, some in asked.items()}}
         shots = Shots(names, images, folder / "masks" if masks else None, folder / LEARNED, options.max_side, request["threads"])
-        result = run_features(request, shots, pairs, spare, options, folder, say, progress)
+        run = partial(run_worker, log=folder / LOG, say=say, progress=progress)
+        result = find_poses(request, shots, pairs, spare, options, folder / "maps", run, say, progress)
         if not result["registered"]:
             raise InputError(
                 f"expected overlapping photographs of one scene in {source}, found none that fit together; take more sharp photographs "
@@ -199,66 +200,6 @@ def describe_request(
         "stretched": STRETCHED,
         "seed": options.seed,
     }
-
-
-def run_features(
-    request: dict[str, Any],
-    shots: Shots,
-    pairs: list[tuple[int, int]],
-    spare: list[tuple[int, int]],
-    options: SfmOptions,
-    folder: Path,
-    say: Say,
-    progress: Progress,
-) -> dict[str, Any]:
-    """Find poses by COLMAP's features, by learned ones too, or by one after the other, and return
-    the result that is kept."""
-    run = partial(run_worker, log=folder / LOG, say=say, progress=progress)
-    if options.features == "learned":
-        run({**request, "poses": False})
-        return {**attempt.reconstruct_with(shots, pairs, request, run, say, progress), "features": "SIFT and ALIKED"}
-    result, request = find_poses(request, folder, run, say)
-    if not attempt.is_wanted(options.features, result, len(shots.names), say):
-        return result
-    model, mapper = Path(request["model"]), "incremental" if options.mapper == "auto" else options.mapper
-    again = {**request, "maps": str(folder / "maps" / "learned"), "model": str(folder / "maps" / "learned-model"), "mapper": mapper}
-    some = attempt.choose_pairs(pairs, spare, shots.names, result["lacking"])
-    try:
-        other = attempt.reconstruct_with(shots, some, again, run, say, progress)
-    except (InputError, RunError) as error:
-        say(f"warning: the result without learned features is kept, because they failed: {error}")
-        return result
-    return attempt.keep_better(result, other, len(shots.names), (model, Path(again["model"])), say)
-
-
-def find_poses(request: dict[str, Any], folder: Path, run: attempt.Worker, say: Say) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Find poses by COLMAP's features. Where those without the smallest were asked for and leave more
-    than a tenth of the photographs without a pose, the smallest are added. Returns the result and
-    the request that led to it."""
-    if request["enough"] is None:
-        return run(request), request
-    result = run({**request, "mapper": "incremental"} if request["mapper"] == "auto" else request)
-    total = sum(map(len, request["groups"]))
-    if len(result["registered"]) >= ENOUGH * total:
-        return result, request
-    if result["large_features"]:
-        say(f"{total - len(result['registered'])} of {total} photographs have no pose yet: smaller features are searched for, too")
-    for left in (folder / "maps", Path(request["model"])):
-        work.remove(left)
-    database = request["database"] + ".all" if result["large_features"] else request["database"]
-    request = {**request, "database": database, "enough": None}
-    return run(request), request
-
-
-def warn_of_mapper(result: dict[str, Any], options: SfmOptions) -> str | None:
-    """Return a warning if the poses are those of the global mapper after the incremental one had
-    failed: it may give every photograph a pose, and wrong ones."""
-    if options.mapper != "auto" or result.get("mapper") != "global" or result.get("one_focal_length"):
-        return None
-    return (
-        "warning: these poses are those of the global mapper, because the incremental one fitted too few photographs together; "
-        "they may be wrong: look at the scene, or take photographs between these"
-    )
 
 
 def check_request(source: Path, out: Path, overwrite: bool) -> None:
