@@ -26,6 +26,7 @@ FEW_FITTING = 4  # other photographs that fit one
 GROWN = 1.3  # times as many photographs or points as at the last adjustment of all poses, from which on they are adjusted anew
 WORSE = 1.1  # times the error of two focal lengths up to which one fits as well
 FITS = 1.0  # pixels of error up to which one is kept where two were not tried
+SEEN_FROM, LOOKED_AT = 2.5, 2000  # degrees between the directions of points, in the median of so many: 1.6 for a camera that only turns
 NEAR = 0.9  # share of the angle of a first pair from which COLMAP may find it
 FEW_FEATURES = 200  # a sharp photograph has thousands
 PROBED = 8  # photographs of a camera from which on two of them show whether the smallest features are needed
@@ -288,7 +289,7 @@ def estimate_all(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
         with colmap.Database.open(ask["database"]) as there:
             guessed = {camera.camera_id: min(camera.params[:2]) for camera in there.read_all_cameras() if camera.model.name == "OPENCV"}
         one = estimate_with_one(colmap, ask, guessed)
-        if len(one["registered"]) >= ENOUGH * sum(map(len, ask["groups"])) and one["error"] <= FITS:
+        if len(one["registered"]) >= ENOUGH * sum(map(len, ask["groups"])) and one["error"] <= FITS and one["angle"] >= SEEN_FROM:
             return keep_one(ask, one)
         report(step="one focal length", kept=False, first=True)
     result = estimate_poses(colmap, ask)
@@ -302,14 +303,14 @@ def estimate_all(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
     if one is None:
         report(step="stretched", ratio=max(lenses[i][1] / lenses[i][0] for i in stretched))
         one = estimate_with_one(colmap, ask, stretched)
-    kept = len(one["registered"]) >= len(result["registered"]) and one["error"] <= WORSE * result["error"]
+    kept = len(one["registered"]) >= len(result["registered"]) and one["error"] <= WORSE * result["error"] and one["angle"] >= SEEN_FROM
     report(step="one focal length", kept=kept, first=False)
     return keep_one(ask, {**one, "mappers": {**result["mappers"], **one["mappers"]}, "lacking": result["lacking"]}) if kept else result
 
 
 def estimate_with_one(colmap: Any, ask: dict[str, Any], focal: dict[int, float]) -> dict[str, Any]:
     """Estimate the poses by the global mapper, with one focal length for these cameras. The model is in
-    the folder of maps."""
+    the folder of maps; `angle` is that of `measure_angles`."""
     again = {
         **ask,
         "database": ask["database"] + ".one",
@@ -319,7 +320,24 @@ def estimate_with_one(colmap: Any, ask: dict[str, Any], focal: dict[int, float])
     }
     shutil.copyfile(ask["database"], again["database"])  # a call that is killed goes on with the lenses that were asked for
     use_one_focal_length(colmap, again["database"], focal)
-    return estimate_poses(colmap, again)
+    found = estimate_poses(colmap, again)
+    return {**found, "angle": measure_angles(colmap.Reconstruction(again["model"])) if found["registered"] else 0.0}
+
+
+def measure_angles(model: Any) -> float:
+    """Return how far apart the directions are, in degrees, from which the points of a model are seen:
+    the median over points of the widest angle. A camera that only turns gives poses that fit, and
+    points of no known depth."""
+    import numpy as np
+
+    centres = {i: image.projection_center() for i, image in model.images.items() if image.has_pose}
+    points = [model.points3D[i] for i in sorted(model.points3D)]
+    widest = []
+    for point in points[:: max(1, len(points) // LOOKED_AT)]:
+        rays = np.array([point.xyz - centres[element.image_id] for element in point.track.elements])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True).clip(1e-12)
+        widest.append(math.degrees(math.acos(min(1.0, max(-1.0, float((rays @ rays.T).min()))))))
+    return float(np.median(widest)) if widest else 0.0
 
 
 def keep_one(ask: dict[str, Any], one: dict[str, Any]) -> dict[str, Any]:

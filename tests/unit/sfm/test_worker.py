@@ -323,6 +323,7 @@ def test_a_lens_with_two_focal_lengths_is_sought_again_with_one(tmp_path, monkey
 
     colmap = SimpleNamespace(Camera=SimpleNamespace, Database=SimpleNamespace(open=open_database), Reconstruction=read_model)
     monkeypatch.setattr(worker, "estimate_poses", estimate)
+    monkeypatch.setattr(worker, "measure_angles", lambda model: 5.0)
     (tmp_path / "db").touch()
     names = {"maps": str(tmp_path / "maps"), "model": str(tmp_path / "model"), "database": str(tmp_path / "db")}
     found = worker.estimate_all(colmap, {**names, "mapper": "auto", "stretched": 1.1, "narrow": False})
@@ -335,18 +336,20 @@ def test_a_lens_with_two_focal_lengths_is_sought_again_with_one(tmp_path, monkey
 
 
 @pytest.mark.parametrize(
-    ("posed", "errors", "mapper", "ran"),
+    ("posed", "errors", "mapper", "angle", "ran"),
     [
-        ((10,), (0.3,), "auto", [("one", True)]),
-        ((9,), (0.3,), "auto", [("one", True)]),
-        ((8, 10), (0.3, 0.3), "auto", [("one", False), ("two", True)]),  # too few fit
-        ((10, 10), (1.3, 1.2), "auto", [("one", True), ("two", False)]),  # two fit badly, too, and are stretched
-        ((10, 10), (1.3, 0.4), "auto", [("one", False), ("two", True)]),
-        ((10, 10), (0.3, 0.3), "incremental", [("two", False), ("one", True)]),  # that mapper was asked for: only its lens may change
+        ((10,), (0.3,), "auto", 4.1, [("one", True)]),
+        ((9,), (0.3,), "auto", 4.1, [("one", True)]),
+        ((8, 10), (0.3, 0.3), "auto", 4.1, [("one", False), ("two", True)]),  # too few fit
+        ((10, 10), (1.3, 1.2), "auto", 4.1, [("one", True), ("two", False)]),  # two fit badly, too, and are stretched
+        ((10, 10), (1.3, 0.4), "auto", 4.1, [("one", False), ("two", True)]),
+        ((10, 10), (0.1, 0.1), "auto", 1.6, [("one", False), ("two", True)]),  # the camera only turns
+        ((10, 10), (0.3, 0.3), "incremental", 4.1, [("two", False), ("one", True)]),  # that one was asked for: only its lens may change
     ],
 )
-def test_one_focal_length_comes_first_where_no_pair_has_a_wide_angle(tmp_path, monkeypatch, capsys, posed, errors, mapper, ran):
+def test_one_focal_length_comes_first_where_no_pair_has_a_wide_angle(tmp_path, monkeypatch, capsys, posed, errors, mapper, angle, ran):
     asked = []
+    monkeypatch.setattr(worker, "measure_angles", lambda model: angle)
 
     def estimate(colmap, ask):
         i = len(asked)
@@ -377,3 +380,16 @@ def test_one_focal_length_comes_first_where_no_pair_has_a_wide_angle(tmp_path, m
     kept = next(name for name, stays in ran if stays)
     assert found.get("one_focal_length", False) is (kept == "one") and (tmp_path / "model" / "cameras.bin").read_text() == kept
     assert ('"narrow"' in capsys.readouterr().out) is (mapper == "auto")
+
+
+def test_the_angles_from_which_the_points_of_a_model_are_seen():
+    centres = {1: [0.0, 0.0, 0.0], 2: [1.0, 0.0, 0.0], 3: [0.1, 0.0, 0.0]}
+    images = {i: SimpleNamespace(has_pose=True, projection_center=lambda at=at: np.array(at)) for i, at in centres.items()}
+
+    def point(z, *seen):
+        return SimpleNamespace(xyz=np.array([0.0, 0.0, z]), track=SimpleNamespace(elements=[SimpleNamespace(image_id=i) for i in seen]))
+
+    points = {5: point(1.0, 1, 2, 3), 7: point(1.0, 1, 3), 9: point(50.0, 1, 2)}  # 45, 5.7 and 1.1 degrees
+    model = SimpleNamespace(images=images, points3D=points)
+    assert worker.measure_angles(model) == pytest.approx(np.degrees(np.arctan(0.1)))
+    assert worker.measure_angles(SimpleNamespace(images=images, points3D={})) == 0.0
