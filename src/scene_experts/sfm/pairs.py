@@ -41,13 +41,17 @@ def follow(count: int, steps: list[int]) -> list[tuple[int, int]]:
     return [(i, i + step) for i in range(count) for step in steps if i + step < count]
 
 
-def find_alike(database: Path, names: list[str], places: Sequence[str] = ()) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+def find_alike(
+    database: Path, names: list[str], places: Sequence[str] = (), *, film: bool = False
+) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Return the pairs of photographs that are matched, and more pairs for those that fit too few
     others.
 
     places: Where each was taken, by any name: photographs of one place, such as the views of a
-    panorama, are not matched. Each photograph is matched with the ALIKE that look most like it, with the FOLLOWING next ones
-    and with the NEAR that were taken nearest to it, where their cameras noted the places.
+    panorama, are not matched. Each photograph is matched with the ALIKE that look most like it, with
+    the FOLLOWING next ones and with the NEAR that were taken nearest to it, where their cameras noted
+    the places. film: They are the frames of a video, of which those most alike show the scene from
+    nearly one place; each is matched with those 8, 16, 32, ... further on, too.
     """
     at = list(places) or [str(i) for i in range(len(names))]
     most = max(Counter(at).values()) - 1  # others of one place
@@ -57,7 +61,8 @@ def find_alike(database: Path, names: list[str], places: Sequence[str] = ()) -> 
     ]
     ordered = lambda i, j: (min(i, j), max(i, j))  # noqa: E731
     near = {ordered(i, j) for i, row in enumerate(ranks) for j in row[:ALIKE]}
-    near |= {*follow(len(names), [*range(1, FOLLOWING + 1)]), *find_near(read_positions(database, names), NEAR)}
+    steps = [*range(1, FOLLOWING + 1), *([1 << k for k in range(3, len(names).bit_length())] if film else [])]
+    near |= {*follow(len(names), steps), *find_near(read_positions(database, names), NEAR)}
     near = {(i, j) for i, j in near if at[i] != at[j]}
     more = {ordered(i, j) for i, row in enumerate(ranks) for j in row[ALIKE:]}
     return sorted(near), sorted(more - near)

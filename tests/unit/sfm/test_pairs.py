@@ -31,6 +31,18 @@ def test_photographs_are_matched_with_those_like_them_and_with_the_next_ones(mon
     assert len(near) <= 50 * (pairs.ALIKE + pairs.FOLLOWING) + 1
 
 
+def test_frames_of_a_video_are_matched_with_some_far_ahead_too(monkeypatch):
+    ranks = [[j for j in (i - 1, i + 1, i + 2) if 0 <= j < 50] for i in range(50)]
+    monkeypatch.setattr(pairs, "describe_photos", lambda database, names: names)
+    monkeypatch.setattr(pairs, "rank_alike", lambda vectors, count: ranks)
+    monkeypatch.setattr(pairs, "read_positions", lambda database, names: None)
+    monkeypatch.setattr(pairs, "find_near", lambda positions, count: [])
+    (photos, _), (film, _) = (pairs.find_alike(None, ["frame"] * 50, film=film) for film in (False, True))
+    more = set(film) - set(photos)
+    assert set(photos) < set(film) and {j - i for i, j in more} <= {8, 16, 32} and {(10, 18), (10, 26), (10, 42)} <= set(film)
+
+
+
 def test_photographs_of_one_place_are_not_matched(monkeypatch):
     ranks = [[(i + step) % 40 for step in range(1, 40)] for i in range(40)]
     asked = []

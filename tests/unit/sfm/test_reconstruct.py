@@ -250,7 +250,7 @@ def test_a_source_that_is_neither_folder_nor_video_is_reported(tmp_path, monkeyp
 def test_the_features_of_many_photographs_decide_which_are_matched(tmp_path, monkeypatch):
     worker, said = fake_worker(**FOUND), []
     monkeypatch.setattr(run, "run_worker", worker)
-    monkeypatch.setattr(run, "find_alike", lambda database, names, places: ([(0, 1), (1, 3)], [(2, 3)]))
+    monkeypatch.setattr(run, "find_alike", lambda database, names, places, film: ([(0, 1), (1, 3)], [(2, 3)]))
     note = run.reconstruct(write_black(tmp_path / "photos", MOST_EXHAUSTIVE + 1), tmp_path / "out", SfmOptions(), say=said.append)
     first, second = worker.requests
     assert first["pairs"] is None and not note["all_compared"] and any("2 of 465 pairs" in line for line in said)
