@@ -71,8 +71,9 @@ def tell(message: dict[str, Any], say: Say, progress: Progress) -> None:
         apart = f" in the largest of {message['parts']} parts, which do not fit together" if message["parts"] > 1 else ""
         posed = f"gave {message['posed']} of {message['photographs']} photographs a pose{apart}"
         say(f"the {message['mapper']} mapper {posed}; the global mapper runs too, and the better result is kept")
-    elif step == "narrow":
-        say("no two pictures show the same points from clearly different directions: one focal length and the global mapper come first")
+    elif step == "one first":
+        why = "no two pictures show the same points from clearly different directions: " if message["narrow"] else ""
+        say(f"{why}one focal length and the global mapper come first")
     elif step == "stretched":
         say(f"COLMAP found a lens with two focal lengths, one {message['ratio']:.2f} times the other: it is sought again with one")
     elif step == "one focal length":

@@ -95,11 +95,12 @@ def reconstruct(
         masks = write_masks(found, images, folder / "masks")
         enough = ENOUGH_FOR_POSES if len(found) <= few and options.features != "learned" else None
         prepare_folder(folder, found, options, masks, enough)
-        request = {**describe_request(folder, images, groups, rig, bool(masks), pairs, names, options), "enough": enough}
+        request = describe_request(folder, images, groups, rig, bool(masks), pairs, names, options)
+        request |= {"enough": enough, "film": source.is_file() and rig is None}
         began = time.monotonic()
         spare: list[tuple[int, int]] = []
         if pairs is None:
-            pairs, spare = pairs_by_features(request, names, source.is_file(), folder, say, progress)
+            pairs, spare = pairs_by_features(request, names, folder, say, progress)
             asked = {"pairs": pairs, "spare": spare}
             request = {**request, **{name: [(names[i], names[j]) for i, j in some] for name, some in asked.items()}}
         shots = Shots(names, images, folder / "masks" if masks else None, folder / LEARNED, options.max_side, request["threads"])
@@ -153,12 +154,12 @@ def pairs_by_number(names: list[str], rig: PanoramaRig | None, options: SfmOptio
 
 
 def pairs_by_features(
-    request: dict[str, Any], names: list[str], film: bool, folder: Path, say: Say, progress: Progress
+    request: dict[str, Any], names: list[str], folder: Path, say: Say, progress: Progress
 ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Find the features, and return the pairs that look alike and those to spare, as places in
-    `names`. film: They are the frames of a video."""
+    `names`."""
     run_worker({**request, "poses": False}, folder / LOG, say, progress)
-    pairs, spare = find_alike(Path(request["database"]), names, [find_place(name) for name in names], film=film)
+    pairs, spare = find_alike(Path(request["database"]), names, [find_place(name) for name in names], film=request["film"])
     every = every_pair([find_place(name) for name in names])
     say(f"{len(pairs):,} of {every:,} pairs to match: photographs that look alike, and each with those that follow it")
     return pairs, spare

@@ -275,8 +275,9 @@ def estimate_poses(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
 
 def estimate_all(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
     """Estimate the poses, with one focal length where the pictures do not tell two apart: first, where
-    no pair of photographs has a wide angle (ask["narrow"]); else for lenses that were found to have
-    two that no lens has, if they took most photographs. Such are a drone's pictures from one height:
+    no pair of photographs has a wide angle (ask["narrow"]), and for the frames of a video
+    (ask["film"]); else for lenses that were found to have two that no lens has, if they took most
+    photographs. Such are a drone's pictures from one height:
     with two focal lengths the scene may be stretched. The poses with one are kept where they are as
     many and fit as well.
 
@@ -284,8 +285,8 @@ def estimate_all(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
     parallel projections, or takes three times as long.
     """
     one: dict[str, Any] | None = None
-    if ask["narrow"] and ask["mapper"] == "auto":
-        report(step="narrow")
+    if (ask["narrow"] or ask["film"]) and ask["mapper"] == "auto":
+        report(step="one first", narrow=ask["narrow"])
         with colmap.Database.open(ask["database"]) as there:
             guessed = {camera.camera_id: min(camera.params[:2]) for camera in there.read_all_cameras() if camera.model.name == "OPENCV"}
         one = estimate_with_one(colmap, ask, guessed)

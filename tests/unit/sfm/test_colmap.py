@@ -33,7 +33,7 @@ def test_each_message_of_the_worker_is_told():
         {"step": "stretched", "ratio": 2.5282},
         {"step": "one focal length", "kept": True, "first": False},
         {"step": "one focal length", "kept": False, "first": False},
-        {"step": "narrow"},
+        {"step": "one first", "narrow": True},
         {"step": "one focal length", "kept": False, "first": True},
         {"step": "done", "registered": []},
     ]

@@ -42,7 +42,6 @@ def test_frames_of_a_video_are_matched_with_some_far_ahead_too(monkeypatch):
     assert set(photos) < set(film) and {j - i for i, j in more} <= {8, 16, 32} and {(10, 18), (10, 26), (10, 42)} <= set(film)
 
 
-
 def test_photographs_of_one_place_are_not_matched(monkeypatch):
     ranks = [[(i + step) % 40 for step in range(1, 40)] for i in range(40)]
     asked = []

@@ -326,7 +326,7 @@ def test_a_lens_with_two_focal_lengths_is_sought_again_with_one(tmp_path, monkey
     monkeypatch.setattr(worker, "measure_angles", lambda model: 5.0)
     (tmp_path / "db").touch()
     names = {"maps": str(tmp_path / "maps"), "model": str(tmp_path / "model"), "database": str(tmp_path / "db")}
-    found = worker.estimate_all(colmap, {**names, "mapper": "auto", "stretched": 1.1, "narrow": False})
+    found = worker.estimate_all(colmap, {**names, "mapper": "auto", "stretched": 1.1, "narrow": False, "film": False})
     assert len(asked) == len(posed) and (tmp_path / "model" / "cameras.bin").read_text() == ("1" if kept else "0")
     assert found.get("one_focal_length", False) is bool(kept)
     if kept is not None:
@@ -347,7 +347,8 @@ def test_a_lens_with_two_focal_lengths_is_sought_again_with_one(tmp_path, monkey
         ((10, 10), (0.3, 0.3), "incremental", 4.1, [("two", False), ("one", True)]),  # that one was asked for: only its lens may change
     ],
 )
-def test_one_focal_length_comes_first_where_no_pair_has_a_wide_angle(tmp_path, monkeypatch, capsys, posed, errors, mapper, angle, ran):
+@pytest.mark.parametrize("film", [False, True])
+def test_one_focal_length_first_for_videos_and_without_wide_angles(tmp_path, monkeypatch, capsys, posed, errors, mapper, angle, ran, film):
     asked = []
     monkeypatch.setattr(worker, "measure_angles", lambda model: angle)
 
@@ -373,13 +374,13 @@ def test_one_focal_length_comes_first_where_no_pair_has_a_wide_angle(tmp_path, m
     monkeypatch.setattr(worker, "use_one_focal_length", lambda colmap, database, focal: firsts.append(focal))
     (tmp_path / "db").touch()
     names = {"maps": str(tmp_path / "maps"), "model": str(tmp_path / "model"), "database": str(tmp_path / "db")}
-    ask = {**names, "mapper": mapper, "stretched": 1.1, "narrow": True, "groups": [["a"] * 6, ["b"] * 4]}
+    ask = {**names, "mapper": mapper, "stretched": 1.1, "narrow": not film, "film": film, "groups": [["a"] * 6, ["b"] * 4]}
     colmap = SimpleNamespace(Database=SimpleNamespace(open=open_database), Reconstruction=read_model)
     found = worker.estimate_all(colmap, ask)
     assert asked == [name for name, _ in ran] and firsts == [{1: 432.0 if mapper == "auto" else 834.2}]
     kept = next(name for name, stays in ran if stays)
     assert found.get("one_focal_length", False) is (kept == "one") and (tmp_path / "model" / "cameras.bin").read_text() == kept
-    assert ('"narrow"' in capsys.readouterr().out) is (mapper == "auto")
+    assert ('"one first"' in capsys.readouterr().out) is (mapper == "auto")
 
 
 def test_the_angles_from_which_the_points_of_a_model_are_seen():
