@@ -321,6 +321,9 @@ def estimate_with_one(colmap: Any, ask: dict[str, Any], focal: dict[int, float])
     }
     shutil.copyfile(ask["database"], again["database"])  # a call that is killed goes on with the lenses that were asked for
     use_one_focal_length(colmap, again["database"], focal)
+    options = colmap.ViewGraphCalibrationOptions()
+    options.random_seed = ask["seed"]
+    colmap.calibrate_view_graph(again["database"], options)  # without it, a guess of half the focal length may lead nowhere
     found = estimate_poses(colmap, again)
     return {**found, "angle": measure_angles(colmap.Reconstruction(again["model"])) if found["registered"] else 0.0}
 

@@ -322,11 +322,12 @@ def test_a_lens_with_two_focal_lengths_is_sought_again_with_one(tmp_path, monkey
         return SimpleNamespace(cameras=found, images={i: SimpleNamespace(camera_id=camera) for i, camera in enumerate(cameras)})
 
     colmap = SimpleNamespace(Camera=SimpleNamespace, Database=SimpleNamespace(open=open_database), Reconstruction=read_model)
+    colmap.ViewGraphCalibrationOptions, colmap.calibrate_view_graph = SimpleNamespace, lambda database, options: True
     monkeypatch.setattr(worker, "estimate_poses", estimate)
     monkeypatch.setattr(worker, "measure_angles", lambda model: 5.0)
     (tmp_path / "db").touch()
     names = {"maps": str(tmp_path / "maps"), "model": str(tmp_path / "model"), "database": str(tmp_path / "db")}
-    found = worker.estimate_all(colmap, {**names, "mapper": "auto", "stretched": 1.1, "narrow": False, "film": False})
+    found = worker.estimate_all(colmap, {**names, "mapper": "auto", "seed": 0, "stretched": 1.1, "narrow": False, "film": False})
     assert len(asked) == len(posed) and (tmp_path / "model" / "cameras.bin").read_text() == ("1" if kept else "0")
     assert found.get("one_focal_length", False) is bool(kept)
     if kept is not None:
@@ -374,9 +375,12 @@ def test_one_focal_length_first_for_videos_and_without_wide_angles(tmp_path, mon
     monkeypatch.setattr(worker, "use_one_focal_length", lambda colmap, database, focal: firsts.append(focal))
     (tmp_path / "db").touch()
     names = {"maps": str(tmp_path / "maps"), "model": str(tmp_path / "model"), "database": str(tmp_path / "db")}
-    ask = {**names, "mapper": mapper, "stretched": 1.1, "narrow": not film, "film": film, "groups": [["a"] * 6, ["b"] * 4]}
+    ask = {**names, "mapper": mapper, "seed": 3, "stretched": 1.1, "narrow": not film, "film": film, "groups": [["a"] * 6, ["b"] * 4]}
     colmap = SimpleNamespace(Database=SimpleNamespace(open=open_database), Reconstruction=read_model)
+    colmap.ViewGraphCalibrationOptions, calibrated = SimpleNamespace, []
+    colmap.calibrate_view_graph = lambda database, options: calibrated.append((database, options.random_seed))
     found = worker.estimate_all(colmap, ask)
+    assert calibrated == [(names["database"] + ".one", 3)]
     assert asked == [name for name, _ in ran] and firsts == [{1: 432.0 if mapper == "auto" else 834.2}]
     kept = next(name for name, stays in ran if stays)
     assert found.get("one_focal_length", False) is (kept == "one") and (tmp_path / "model" / "cameras.bin").read_text() == kept
