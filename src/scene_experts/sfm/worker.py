@@ -277,9 +277,8 @@ def estimate_all(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
     """Estimate the poses, with one focal length where the pictures do not tell two apart: first, where
     no pair of photographs has a wide angle (ask["narrow"]), and for the frames of a video
     (ask["film"]); else for lenses that were found to have two that no lens has, if they took most
-    photographs. Such are a drone's pictures from one height:
-    with two focal lengths the scene may be stretched. The poses with one are kept where they are as
-    many and fit as well.
+    photographs. Such are a drone's pictures from one height: with two focal lengths the scene may be
+    stretched. The poses with one are kept where they are as many and fit as well.
 
     They are those of the global mapper: the incremental one does not begin where pictures are nearly
     parallel projections, or takes three times as long.
