@@ -26,6 +26,7 @@ FEW_FITTING = 4  # other photographs that fit one
 GROWN = 1.3  # times as many photographs or points as at the last adjustment of all poses, from which on they are adjusted anew
 WORSE = 1.1  # times the error of two focal lengths up to which one fits as well
 FITS = 1.0  # pixels of error up to which one is kept where two were not tried
+SEEN = 30  # points of the model that a photograph shows, in the mean; a camera that only turns may leave 5
 SEEN_FROM, LOOKED_AT = 2.5, 2000  # degrees between the directions of points, in the median of so many: 1.6 for a camera that only turns
 NEAR = 0.9  # share of the angle of a first pair from which COLMAP may find it
 FEW_FEATURES = 200  # a sharp photograph has thousands
@@ -289,7 +290,7 @@ def estimate_all(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
         with colmap.Database.open(ask["database"]) as there:
             guessed = {camera.camera_id: min(camera.params[:2]) for camera in there.read_all_cameras() if camera.model.name == "OPENCV"}
         one = estimate_with_one(colmap, ask, guessed)
-        if len(one["registered"]) >= ENOUGH * sum(map(len, ask["groups"])) and one["error"] <= FITS and one["angle"] >= SEEN_FROM:
+        if len(one["registered"]) >= ENOUGH * sum(map(len, ask["groups"])) and one["error"] <= FITS and one["deep"]:
             return keep_one(ask, one)
         report(step="one focal length", kept=False, first=True)
     result = estimate_poses(colmap, ask)
@@ -303,14 +304,14 @@ def estimate_all(colmap: Any, ask: dict[str, Any]) -> dict[str, Any]:
     if one is None:
         report(step="stretched", ratio=max(lenses[i][1] / lenses[i][0] for i in stretched))
         one = estimate_with_one(colmap, ask, stretched)
-    kept = len(one["registered"]) >= len(result["registered"]) and one["error"] <= WORSE * result["error"] and one["angle"] >= SEEN_FROM
+    kept = len(one["registered"]) >= len(result["registered"]) and one["error"] <= WORSE * result["error"] and one["deep"]
     report(step="one focal length", kept=kept, first=False)
     return keep_one(ask, {**one, "mappers": {**result["mappers"], **one["mappers"]}, "lacking": result["lacking"]}) if kept else result
 
 
 def estimate_with_one(colmap: Any, ask: dict[str, Any], focal: dict[int, float]) -> dict[str, Any]:
     """Estimate the poses by the global mapper, with one focal length for these cameras. The model is in
-    the folder of maps; `angle` is that of `measure_angles`."""
+    the folder of maps; `deep` says whether its points have a depth."""
     again = {
         **ask,
         "database": ask["database"] + ".one",
@@ -324,7 +325,10 @@ def estimate_with_one(colmap: Any, ask: dict[str, Any], focal: dict[int, float])
     options.random_seed = ask["seed"]
     colmap.calibrate_view_graph(again["database"], options)  # without it, a guess of half the focal length may lead nowhere
     found = estimate_poses(colmap, again)
-    return {**found, "angle": measure_angles(colmap.Reconstruction(again["model"])) if found["registered"] else 0.0}
+    deep = (
+        bool(found["registered"]) and found["observations"] >= SEEN and measure_angles(colmap.Reconstruction(again["model"])) >= SEEN_FROM
+    )
+    return {**found, "deep": deep}
 
 
 def measure_angles(model: Any) -> float:

@@ -310,7 +310,14 @@ def test_a_lens_with_two_focal_lengths_is_sought_again_with_one(tmp_path, monkey
         asked.append(ask)
         Path(ask["model"]).mkdir(parents=True)
         (Path(ask["model"]) / "cameras.bin").write_text(str(i))
-        return {"registered": ["a"] * posed[i], "lacking": [], "mapper": "incremental", "mappers": {}, "error": errors[i]}
+        return {
+            "registered": ["a"] * posed[i],
+            "lacking": [],
+            "mapper": "incremental",
+            "mappers": {},
+            "error": errors[i],
+            "observations": 900.0,
+        }
 
     @contextmanager
     def open_database(path):
@@ -337,19 +344,29 @@ def test_a_lens_with_two_focal_lengths_is_sought_again_with_one(tmp_path, monkey
 
 
 @pytest.mark.parametrize(
-    ("posed", "errors", "mapper", "angle", "ran"),
+    ("posed", "errors", "mapper", "angle", "seen", "ran"),
     [
-        ((10,), (0.3,), "auto", 4.1, [("one", True)]),
-        ((9,), (0.3,), "auto", 4.1, [("one", True)]),
-        ((8, 10), (0.3, 0.3), "auto", 4.1, [("one", False), ("two", True)]),  # too few fit
-        ((10, 10), (1.3, 1.2), "auto", 4.1, [("one", True), ("two", False)]),  # two fit badly, too, and are stretched
-        ((10, 10), (1.3, 0.4), "auto", 4.1, [("one", False), ("two", True)]),
-        ((10, 10), (0.1, 0.1), "auto", 1.6, [("one", False), ("two", True)]),  # the camera only turns
-        ((10, 10), (0.3, 0.3), "incremental", 4.1, [("two", False), ("one", True)]),  # that one was asked for: only its lens may change
+        ((10,), (0.3,), "auto", 4.1, 900.0, [("one", True)]),
+        ((9,), (0.3,), "auto", 4.1, 900.0, [("one", True)]),
+        ((8, 10), (0.3, 0.3), "auto", 4.1, 900.0, [("one", False), ("two", True)]),  # too few fit
+        ((10, 10), (1.3, 1.2), "auto", 4.1, 900.0, [("one", True), ("two", False)]),  # two fit badly, too, and are stretched
+        ((10, 10), (1.3, 0.4), "auto", 4.1, 900.0, [("one", False), ("two", True)]),
+        ((10, 10), (0.1, 0.1), "auto", 1.6, 900.0, [("one", False), ("two", True)]),  # the camera only turns
+        ((10, 10), (0.4, 0.1), "auto", 5.0, 5.0, [("one", False), ("two", True)]),  # the same, with five points
+        (
+            (10, 10),
+            (0.3, 0.3),
+            "incremental",
+            4.1,
+            900.0,
+            [("two", False), ("one", True)],
+        ),  # that one was asked for: only its lens may change
     ],
 )
 @pytest.mark.parametrize("film", [False, True])
-def test_one_focal_length_first_for_videos_and_without_wide_angles(tmp_path, monkeypatch, capsys, posed, errors, mapper, angle, ran, film):
+def test_one_focal_length_first_for_videos_and_without_wide_angles(
+    tmp_path, monkeypatch, capsys, posed, errors, mapper, angle, seen, ran, film
+):
     asked = []
     monkeypatch.setattr(worker, "measure_angles", lambda model: angle)
 
@@ -359,7 +376,7 @@ def test_one_focal_length_first_for_videos_and_without_wide_angles(tmp_path, mon
         assert ask["mapper"] == ("global" if asked[i] == "one" else mapper)
         Path(ask["model"]).mkdir(parents=True)
         (Path(ask["model"]) / "cameras.bin").write_text(asked[i])
-        return {"registered": ["a"] * posed[i], "lacking": [], "mappers": {asked[i]: posed[i]}, "error": errors[i]}
+        return {"registered": ["a"] * posed[i], "lacking": [], "mappers": {asked[i]: posed[i]}, "error": errors[i], "observations": seen}
 
     def read_model(folder):
         lens = SimpleNamespace(model=SimpleNamespace(name="OPENCV"), params=[2109.0, 834.2, 144.0, 180.0])
