@@ -62,7 +62,6 @@ def draw(rows: list[dict[str, Any]], place: Path) -> None:
     from matplotlib import pyplot
     from matplotlib.ticker import FixedLocator, NullFormatter, StrMethodFormatter
 
-    matplotlib.rcParams["svg.hashsalt"] = "size"
     captures = list(dict.fromkeys(row["capture"] for row in rows))
     figure, axes = pyplot.subplots(2, len(captures), figsize=(2.6 * len(captures) + 0.6, 4.6), squeeze=False, sharex="col")
     named = {}
@@ -90,7 +89,7 @@ def draw(rows: list[dict[str, Any]], place: Path) -> None:
     figure.supxlabel("MB of the file, networks included", fontsize=9, y=0.1)
     figure.legend(named.values(), named.keys(), loc="lower center", ncols=3, fontsize=8, frameon=False)
     figure.tight_layout(rect=(0, 0.09, 1, 1))
-    figure.savefig(place, dpi=110, metadata={"Date": None} if place.suffix == ".svg" else None)
+    figure.savefig(place, dpi=110)
 
 
 def main() -> None:

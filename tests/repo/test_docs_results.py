@@ -369,3 +369,12 @@ def test_every_figure_of_the_summary_stands_with_its_evidence():
     evidence = {figure for page in (ROOT / "results").rglob("*.md") for figure in number.findall(page.read_text())}
     figures_of_the_summary = set(number.findall((ROOT / SUMMARY).read_text()))
     assert len(figures_of_the_summary) > 80 and not figures_of_the_summary - evidence
+
+
+def test_the_size_of_files_in_the_readme_is_that_of_the_curve():
+    rows = json.loads((ROOT / "results/size-curve.json").read_text())
+    fern = [row for row in rows if row["capture"] == "fern"]
+    (ours,) = (row for row in fern if row["rate"] == 0.002 and row["quality"] == 0.2)
+    best = max((row for row in fern if row["format"] == "sog"), key=lambda row: row["psnr"])
+    small, gain, large = f"{ours['bytes'] / 1e6:.2f} MB", f"{ours['psnr'] - best['psnr']:.1f} dB", f"{best['bytes'] / 1e6:.1f} MB"
+    assert f"fern takes {small} with `--rate 0.002` and has {gain} more PSNR than {large} of 3DGS-MCMC as `sog`" in prose("README.md")
