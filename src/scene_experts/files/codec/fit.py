@@ -23,7 +23,7 @@ from scene_experts.files.codec.reference import Ints
 from scene_experts.files.codec.streams import as_inputs
 
 ROWS = 32_768  # anchors that a model is fitted to, at most
-STEPS, BATCH, RATE = 240, 2048, 0.02
+STEPS, BATCH, RATE = 160, 1024, 0.03
 PER_STEP = 4  # anchors for each step, at least: few anchors cannot tell more
 PRICE = 8.0  # bits, of each unit of the size of a weight (in deviations); spread over the anchors
 _MEAN, _SPREAD = 64.0, 6  # units of a weight of the mean; shift of those of the spread
