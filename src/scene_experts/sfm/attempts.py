@@ -13,7 +13,7 @@ from scene_experts.sfm.colmap import Say
 from scene_experts.sfm.learned import attempt
 from scene_experts.sfm.learned.photographs import Shots
 from scene_experts.sfm.options import SfmOptions
-from scene_experts.sfm.worker import ENOUGH
+from scene_experts.sfm.worker.poses import ENOUGH
 
 
 def find_poses(

@@ -16,22 +16,24 @@ from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.extras import install_line
 from scene_experts.core.io import write_bytes
 from scene_experts.core.progress import Progress
-from scene_experts.sfm import worker
 
 Say = Callable[[str], None]
+WORKER = "scene_experts.sfm.worker"
+ROOT = Path(__file__).parents[2]  # where it is found, whatever the paths of this process are
 
 
 def run_worker(request: dict[str, Any], log: Path, say: Say, progress: Progress) -> dict[str, Any]:
-    """Run COLMAP in a process of its own (`worker.py`) and return its last message.
+    """Run COLMAP in a process of its own (`worker`) and return its last message.
 
     Raises InputError if pycolmap cannot be used, RunError if the worker fails.
     """
     environment = {**os.environ, "OMP_NUM_THREADS": str(request["threads"])}
+    start = f"import runpy, sys; sys.path.append({str(ROOT)!r}); runpy.run_module({WORKER!r}, run_name='__main__')"
     with log.open("a") as stream:
-        # -P: modules are not searched in the worker's folder. In a new session, because this
-        # process handles Ctrl-C.
+        # -P: modules are not searched in the current folder. In a new session, because this process
+        # handles Ctrl-C.
         process = subprocess.Popen(
-            [sys.executable, "-P", worker.__file__],
+            [sys.executable, "-P", "-c", start],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stream, text=True, env=environment, start_new_session=True,
         )  # fmt: skip
         assert process.stdin is not None and process.stdout is not None

@@ -16,8 +16,9 @@ from scene_experts.sfm import colmap
     ],
 )  # fmt: skip
 def test_a_failed_worker_is_reported(tmp_path, monkeypatch, code, error, fact):
-    (tmp_path / "worker.py").write_text(code)
-    monkeypatch.setattr(colmap.worker, "__file__", str(tmp_path / "worker.py"))
+    (tmp_path / "made_worker.py").write_text(code)
+    monkeypatch.setattr(colmap, "WORKER", "made_worker")
+    monkeypatch.setattr(colmap, "ROOT", tmp_path)
     with pytest.raises(error, match=fact):
         colmap.run_worker({"threads": 1, "pairs": ["x" * 200] * 1000}, tmp_path / "colmap.log", lambda _: None, lambda *_: None)
 

@@ -17,7 +17,7 @@ from scene_experts.sfm.learned import photographs
 from scene_experts.sfm.learned.weights import INSTALL, find_weights, load_networks
 from scene_experts.sfm.options import Features
 from scene_experts.sfm.pairs import MOST_EXHAUSTIVE
-from scene_experts.sfm.worker import ENOUGH
+from scene_experts.sfm.worker.poses import ENOUGH
 
 MOST = 3000  # pairs, unless asked for: nearly an hour of a core
 
