@@ -8,15 +8,12 @@ from dataclasses import dataclass, field, replace
 
 from scene_experts.bench.advice import FEW, Advice, suggest
 from scene_experts.core.progress import Progress, Speedometer
-from scene_experts.training.progress import count_left, format_duration
+from scene_experts.training.progress import count_left, count_spent, format_duration
 
 TRAINING = "training"  # the work whose parts become longer
 FOR_PAGE = 0.05  # share of the time after the poses that the page gets
 LEAST_PAGE, MOST_PAGE = 15.0, 60.0  # seconds of it
 FOR_SCORES = 0.15  # the same for the scores, where they are asked for
-GROWTH = 1.7
-"""Time of a whole training over ten times that of its first tenth: a scene grows. 1.3 to 2.6 in eight
-trainings of 4,000 iterations on banana, brighton, fern and kitchen."""
 LOOK = 0.1  # share of the iterations after which the speed is known
 CLOSE = (0.8, 1.3)  # a training whose time will be this share of what it has is not begun anew
 LEAST, MOST, MOST_OF_FEW = 300, 30_000, 7_000  # iterations; the last with few photographs (`bench.advice.FEW`)
@@ -60,6 +57,7 @@ class Whole:
         self.progress, self.now, self.what, self.pace = progress, now, "", Speedometer(now)
         self.later = 0.0  # seconds of the stages after this one
         self.least: Callable[[], float] = lambda: 0.0  # seconds that the whole takes in any case
+        self.start = 0  # rows that the training starts from, 0: not known
 
     def __call__(self, what: str, done: int, total: int) -> None:
         """Show that `done` of `total` parts of the work `what` are done."""
@@ -69,7 +67,7 @@ class Whole:
         if speed is None or total <= 0:
             self.progress(what, done, total)
             return
-        parts = count_left(done, total) if what == TRAINING else max(0, total - done)
+        parts = count_left(done, total, self.start) if what == TRAINING else max(0, total - done)
         left = max(parts / speed + self.later, self.least())
         self.progress(f"{what} (about {format_duration(left)} left in all)", done, total)
 
@@ -91,10 +89,11 @@ def plan_training(width: int, height: int, views: int, have: float | None, slow:
     return replace(advice, iterations=iterations, minutes=advice.minutes * iterations / advice.iterations)
 
 
-def find_slowness(iterations: int, step: int, seconds: float, minutes: float | None, have: float) -> float | None:
+def find_slowness(iterations: int, step: int, seconds: float, minutes: float | None, have: float, start: int = 0) -> float | None:
     """Return how many times longer than the estimated minutes a training of `iterations` will take,
-    from the seconds of its first `step`. None where it will take about what it has."""
-    expected = seconds / max(step, 1) * iterations * GROWTH
+    from the seconds of its first `step`. None where it will take about what it has. start: rows that
+    it starts from, 0: not known."""
+    expected = seconds * count_spent(1.0, start) / count_spent(max(step, 1) / iterations, start)
     if CLOSE[0] <= expected / max(have, 1e-9) <= CLOSE[1]:
         return None
     return expected / 60 / minutes if minutes else expected / max(have, 1e-9)

@@ -35,7 +35,7 @@ from scene_experts.sfm.options import SfmOptions, SourceOptions
 from scene_experts.sfm.reconstruct import NOTE, check_request, reconstruct
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
-from scene_experts.training.events import Event, Stepped
+from scene_experts.training.events import Event, Started, Stepped
 from scene_experts.training.recipes import PROPOSED
 
 CAPTURE, RUN, PAGE, SOURCE = "capture", "run", "scene.html", "source.json"
@@ -259,7 +259,7 @@ def describe_begun(folder: Path, config: RunConfig) -> str:
 
 
 def train(
-    plan: TrainingPlan, folder: Path, budget: TimeBudget, scores: bool, progress: Progress, say: Callable[[str], None]
+    plan: TrainingPlan, folder: Path, budget: TimeBudget, scores: bool, progress: Whole, say: Callable[[str], None]
 ) -> tuple[Run, float | None]:
     """Train. Where the first tenth shows that the machine is slower or faster than estimated, the
     training begins anew, once, with what fits the time.
@@ -273,13 +273,15 @@ def train(
         trainer = Trainer(plan.recipe, plan.capture, folder, resume=begun, overwrite=not begun, preview_every=0, save_every=SAVE_EVERY)
         recent: list[Stepped] = []
         for event in saved_when_interrupted(trainer):
+            if isinstance(event, Started):
+                progress.start = 0 if event.step else event.anchors
             if not isinstance(event, Stepped):
                 continue
             progress(TRAINING, event.step, plan.recipe.iterations)
             recent = [*(one for one in recent if event.step - one.step <= RECENT), event]
             if not settled and have is not None and event.step >= LOOK * plan.recipe.iterations:
                 settled = True
-                slow = find_slowness(plan.recipe.iterations, event.step, event.seconds, minutes, have)
+                slow = find_slowness(plan.recipe.iterations, event.step, event.seconds, minutes, have, progress.start)
                 other = None if slow is None else plan.fit(budget.for_training(scores), slow)
                 if other and plan.pays(other, event.step):
                     trainer.stop("another training fits the time")

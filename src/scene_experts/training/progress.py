@@ -20,20 +20,29 @@ from scene_experts.training.events import Densified, Event, Exported, Finished, 
 SMOOTHING = 0.9  # weight of the previous value in the running means of loss and PSNR
 
 
-GROWN = 1.2
-"""How much more an iteration costs once a scene has grown, in the second half: a whole training
-then takes 1.7 times ten first tenths (`making.budget.GROWTH`)."""
+GROWN = {0: 1.2, 26_000: 0.3}
+"""How much more an iteration costs on a CPU once a scene has grown, in the second half, by the number
+of rows that it starts from, at least. Whole trainings took 1.3 to 2.6 times ten first tenths in
+eight of banana, brighton, fern and kitchen, which start from few rows; 1.05 (South Building) and
+1.44 (bonsai) from many."""
 
 
-def count_left(step: int, total: int) -> float:
+def count_spent(share: float, start: int = 0) -> float:
+    """Return the cost of the first `share` of a training that starts from so many rows (0: not known),
+    in trainings of which no iteration grows."""
+    if torch.cuda.is_available():  # not measured there: iterations count alike
+        return share
+    grown = GROWN[max(least for least in GROWN if least <= start)]
+    return share + grown * (min(share, 0.5) ** 2 + max(0.0, share - 0.5))
+
+
+def count_left(step: int, total: int, start: int = 0) -> float:
     """Return how many iterations as long as the present one are left. On the CPU those of a growing
-    scene become longer; on CUDA that is not measured, and they count alike."""
+    scene become longer. start: as for `count_spent`."""
     if torch.cuda.is_available():
         return total - step
-    grown = lambda share: 1 + GROWN * min(2 * share, 1.0)  # noqa: E731
-    spent = lambda share: share + GROWN * (min(share, 0.5) ** 2 + max(0.0, share - 0.5))  # noqa: E731
-    done = step / total
-    return total * (spent(1.0) - spent(done)) / grown(done)
+    grown = GROWN[max(least for least in GROWN if least <= start)]
+    return total * (count_spent(1.0, start) - count_spent(step / total, start)) / (1 + grown * min(2 * step / total, 1.0))
 
 
 class TrainingProgress:
@@ -52,6 +61,7 @@ class TrainingProgress:
     live: Live | None
     total: int
     first: int
+    start: int
     began: float
     printed: float
     loss: dict[str, float]
@@ -63,7 +73,7 @@ class TrainingProgress:
     def __init__(self, console: Console, every: float = 15.0, out: Path | None = None) -> None:
         self.console, self.every, self.out, self.pictured = console, every, out, False
         self.live = Live(console=console, refresh_per_second=4, transient=True) if console.is_terminal else None
-        self.total, self.first, self.began, self.printed = 0, 0, time.perf_counter(), 0.0
+        self.total, self.first, self.start, self.began, self.printed = 0, 0, 0, time.perf_counter(), 0.0
         self.loss, self.psnr = {}, None
         self.traits = Traits("", "rows")
         self.pace = Speedometer()
@@ -82,6 +92,7 @@ class TrainingProgress:
         match event:
             case Started():
                 self.total, self.first, self.began = event.total, event.step, time.perf_counter()
+                self.start = 0 if event.step else event.anchors
                 self.pace = Speedometer()
                 verb = f"resumed at iteration {event.step:,}" if event.step else "started"
                 self.traits, rows = event.traits, event.traits.rows
@@ -126,7 +137,8 @@ class TrainingProgress:
             self.loss[name] = SMOOTHING * self.loss.get(name, value) + (1 - SMOOTHING) * value
         self.psnr = event.psnr if self.psnr is None else SMOOTHING * self.psnr + (1 - SMOOTHING) * event.psnr
         speed = self.pace(event.step)
-        left = "-:-- left" if speed is None else f"{format_duration(count_left(event.step, self.total) / speed)} left  {speed:.1f} it/s"
+        seconds = None if speed is None else count_left(event.step, self.total, self.start) / speed
+        left = "-:-- left" if seconds is None else f"{format_duration(seconds)} left  {speed:.1f} it/s"
         terms = " ".join(f"{name} {value:.4f}" for name, value in self.loss.items())
         active = f"active {100 * event.active:.0f} %  " if self.traits.activation else ""
         line = (  # a narrow terminal cuts the end off
