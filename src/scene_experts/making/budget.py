@@ -11,16 +11,17 @@ from scene_experts.core.progress import Progress, Speedometer
 from scene_experts.training.progress import count_left, count_spent, format_duration
 
 TRAINING = "training"  # the work whose parts become longer
-FOR_PAGE = 0.05  # share of the time after the poses that the page gets
-LEAST_PAGE, MOST_PAGE = 15.0, 60.0  # seconds of it
-FOR_SCORES = 0.15  # the same for the scores, where they are asked for
+FOR_PAGE = 0.03  # share of the time after the poses that the page gets
+LEAST_PAGE, MOST_PAGE = 8.0, 30.0  # seconds of it; 5 to 7 were measured
+FOR_SCORES = 0.15  # the same for the scores, at most
+SCORES, SCORE = 5.0, 6.0  # seconds of the scores and of each view that has one; 2 to 8 were measured
 LOOK = 0.1  # share of the iterations after which the speed is known
 CLOSE = (0.8, 1.3)  # a training whose time will be this share of what it has is not begun anew
 LEAST, MOST, MOST_OF_FEW = 300, 30_000, 7_000  # iterations; the last with few photographs (`bench.advice.FEW`)
 FIRST = 0.5
 """Share of the iterations that `info` proposes, without --minutes. Twice as many gain 0.1 to 0.6 dB and 5 to
 8 % of LPIPS, and are three quarters of the whole time (results/to-page.md)."""
-PAGE_GUESS, SCORES_GUESS = 20.0, 40.0  # seconds, before anything is known
+PAGE_GUESS = 10.0  # seconds, before anything is known
 
 
 @dataclass(frozen=True)
@@ -40,13 +41,18 @@ class TimeBudget:
         """Seconds that are left, at least 0; None without a limit."""
         return None if self.seconds is None else max(0.0, self.began + self.seconds - self.now())
 
-    def for_training(self, scores: bool) -> float | None:
-        """Seconds that the training may take from now on."""
+    def for_training(self, held: int) -> float | None:
+        """Seconds that the training may take from now on. held: photographs that will be scored."""
         left = self.left
         if left is None:
             return None
         page = min(max(FOR_PAGE * left, LEAST_PAGE), MOST_PAGE)
-        return max(0.0, left - page - (FOR_SCORES * left if scores else 0.0))
+        return max(0.0, left - page - min(guess_scores(held), FOR_SCORES * left))
+
+
+def guess_scores(held: int) -> float:
+    """Seconds that the scores of so many photographs take."""
+    return SCORES + SCORE * held if held else 0.0
 
 
 class Whole:

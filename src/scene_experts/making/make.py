@@ -28,7 +28,7 @@ from scene_experts.core.signals import handled
 from scene_experts.data.readers import is_capture
 from scene_experts.files.export import export_several
 from scene_experts.files.options import Options
-from scene_experts.making.budget import LEAST, LOOK, PAGE_GUESS, SCORES_GUESS, TRAINING, TimeBudget, Whole, find_slowness, plan_training
+from scene_experts.making.budget import LEAST, LOOK, PAGE_GUESS, TRAINING, TimeBudget, Whole, find_slowness, guess_scores, plan_training
 from scene_experts.sfm.drift import drifts
 from scene_experts.sfm.lacking import explain_lacking
 from scene_experts.sfm.options import SfmOptions, SourceOptions
@@ -104,13 +104,13 @@ def make(
     place = find_poses(source, folder, options, say, show)
     took["poses"], show.least = monotonic() - began, lambda: 0.0
     plan = prepare(place, folder / RUN, budget, scores, say)
-    rest = PAGE_GUESS + (SCORES_GUESS if scores else 0.0)
-    show.later, began = rest if budget.left is None else budget.left - (budget.for_training(scores) or 0.0), monotonic()
-    run, psnr = train(plan, folder / RUN, budget, scores, show, say)
+    rest = PAGE_GUESS + guess_scores(plan.held)
+    show.later, began = rest if budget.left is None else budget.left - (budget.for_training(plan.held) or 0.0), monotonic()
+    run, psnr = train(plan, folder / RUN, budget, show, say)
     took["training"] = monotonic() - began
     report, began, show.later = None, monotonic(), 0.0
     if scores:
-        show("scores", 0, len(plan.capture.test_cameras))
+        show("scores", 0, plan.held)
         psnr = run.evaluate(lpips=True).psnr
         report = run.report()
     took["scores"] = monotonic() - began
@@ -195,6 +195,11 @@ class TrainingPlan:
     slow: float = 1.0  # times that the machine takes of it, as far as known
     begun: bool = False  # by an earlier call
 
+    @property
+    def held(self) -> int:
+        """How many photographs are held out."""
+        return len(self.capture.test_cameras)
+
     def fit(self, have: float | None, slow: float = 1.0) -> TrainingPlan:
         """Return the plan for `have` seconds on a machine that takes `slow` times the estimate."""
         views = len(self.capture.train_cameras)
@@ -239,7 +244,7 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
     lens = whole.cameras[0]
     first = TrainingPlan(place, split, (lens.width, lens.height), whole, recipe(PROPOSED, exposure=drifts(place)))
     share = measure_share(torch.get_num_threads())
-    plan = first.fit(budget.for_training(scores), 1 / share)
+    plan = first.fit(budget.for_training(first.held), 1 / share)
     held = f", {len(whole.test_cameras)} held out" if scores else ""
     about = f", {told}" if plan.advice and (told := plan.advice.tell(share)) else ""
     learned = ", their exposures" if plan.recipe.exposure else ""
@@ -258,9 +263,7 @@ def describe_begun(folder: Path, config: RunConfig) -> str:
     return f"{state}: {iterations:,} iterations, {config.data.resolution}; to train anew, {again}"
 
 
-def train(
-    plan: TrainingPlan, folder: Path, budget: TimeBudget, scores: bool, progress: Whole, say: Callable[[str], None]
-) -> tuple[Run, float | None]:
+def train(plan: TrainingPlan, folder: Path, budget: TimeBudget, progress: Whole, say: Callable[[str], None]) -> tuple[Run, float | None]:
     """Train. Where the first tenth shows that the machine is slower or faster than estimated, the
     training begins anew, once, with what fits the time.
 
@@ -268,7 +271,7 @@ def train(
     """
     settled = plan.begun
     while True:
-        have, other = budget.for_training(scores), None
+        have, other = budget.for_training(plan.held), None
         begun, minutes = plan.begun, plan.advice.minutes if plan.advice else None
         trainer = Trainer(plan.recipe, plan.capture, folder, resume=begun, overwrite=not begun, preview_every=0, save_every=SAVE_EVERY)
         recent: list[Stepped] = []
@@ -282,7 +285,7 @@ def train(
             if not settled and have is not None and event.step >= LOOK * plan.recipe.iterations:
                 settled = True
                 slow = find_slowness(plan.recipe.iterations, event.step, event.seconds, minutes, have, progress.start)
-                other = None if slow is None else plan.fit(budget.for_training(scores), slow)
+                other = None if slow is None else plan.fit(budget.for_training(plan.held), slow)
                 if other and plan.pays(other, event.step):
                     trainer.stop("another training fits the time")
                 else:

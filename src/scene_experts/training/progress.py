@@ -20,11 +20,11 @@ from scene_experts.training.events import Densified, Event, Exported, Finished, 
 SMOOTHING = 0.9  # weight of the previous value in the running means of loss and PSNR
 
 
-GROWN = {0: 1.2, 26_000: 0.3}
+GROWN = {0: 1.0, 26_000: 0.3}
 """How much more an iteration costs on a CPU once a scene has grown, in the second half, by the number
 of rows that it starts from, at least. Whole trainings took 1.3 to 2.6 times ten first tenths in
-eight of banana, brighton, fern and kitchen, which start from few rows; 1.05 (South Building) and
-1.44 (bonsai) from many."""
+eight of banana, brighton, fern and kitchen, and 1.2 and 1.3 in two of banana on an idle machine,
+which start from few rows; 1.05 (South Building) and 1.44 (bonsai) from many."""
 
 
 def count_spent(share: float, start: int = 0) -> float:

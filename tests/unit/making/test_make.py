@@ -108,11 +108,11 @@ def test_scores_of_too_few_photographs_are_refused_before_the_training(capture, 
 
 
 def test_a_training_that_would_not_fit_begins_anew_with_other_iterations(capture, tmp_path, trained):
-    trained.Trainer.seconds = 0.1  # 1,000 iterations would take 170 s with growth
+    trained.Trainer.seconds = 0.1  # 1,000 iterations would take 159 s with growth
     make(capture, tmp_path / "out", minutes=1.5, say=lambda _: None)
     first, second = trained.made
     assert first.stopped and not second.stopped
-    assert second.recipe.iterations == pytest.approx(75 / (170 / 60) * 10, rel=0.02)  # 15 of 90 s are the page's; 170 s for 1 min
+    assert second.recipe.iterations == pytest.approx(82 / (159 / 60) * 10, rel=0.02)  # 8 of 90 s are the page's; 159 s for 1 min
 
 
 def test_a_training_is_not_begun_anew_for_one_that_ends_later(capture, tmp_path):

@@ -91,7 +91,7 @@ def test_the_time_left_is_that_of_the_measured_speed(monkeypatch):
     assert "-:-- left" in first and f"{format_duration(count_left(50, 200) / 10)} left  10.0 it/s" in second
 
 
-@pytest.mark.parametrize(("start", "grown", "whole"), [(0, 1.2, 1.7), (25_999, 1.2, 1.7), (26_000, 0.3, 1.19)])
+@pytest.mark.parametrize(("start", "grown", "whole"), [(0, 1.0, 1.6), (25_999, 1.0, 1.6), (26_000, 0.3, 1.19)])
 def test_iterations_of_a_growing_scene_count_more(monkeypatch, start, grown, whole):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     costs = [1 + grown * min(2 * i / 1000, 1) for i in range(1000)]
