@@ -12,16 +12,16 @@ from scene_experts.training.progress import count_left, count_spent, format_dura
 
 TRAINING = "training"  # the work whose parts become longer
 FOR_PAGE = 0.03  # share of the time after the poses that the page gets
-LEAST_PAGE, MOST_PAGE = 8.0, 30.0  # seconds of it; 5 to 7 were measured
-FOR_SCORES = 0.15  # the same for the scores, at most
-SCORES, SCORE = 5.0, 6.0  # seconds of the scores and of each view that has one; 2 to 8 were measured
+LEAST_PAGE, MOST_PAGE = 8.0, 30.0  # seconds that it gets; 5 to 7 were measured
+FOR_SCORES = 0.15  # largest share that the scores get
+SCORES, SCORE = 5.0, 6.0  # seconds of the scores, and of each view that has one: in all 9 to 19 of 2 views, 50 of 16
 LOOK = 0.1  # share of the iterations after which the speed is known
 CLOSE = (0.8, 1.3)  # a training whose time will be this share of what it has is not begun anew
 LEAST, MOST, MOST_OF_FEW = 300, 30_000, 7_000  # iterations; the last with few photographs (`bench.advice.FEW`)
 FIRST = 0.5
 """Share of the iterations that `info` proposes, without --minutes. Twice as many gain 0.1 to 0.6 dB and 5 to
 8 % of LPIPS, and are three quarters of the whole time (results/to-page.md)."""
-PAGE_GUESS = 10.0  # seconds, before anything is known
+PAGE_GUESS = 10.0  # seconds of the page, without --minutes
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,6 @@ class Whole:
         self.progress, self.now, self.what, self.pace = progress, now, "", Speedometer(now)
         self.later = 0.0  # seconds of the stages after this one
         self.least: Callable[[], float] = lambda: 0.0  # seconds that the whole takes in any case
-        self.start = 0  # rows that the training starts from, 0: not known
 
     def __call__(self, what: str, done: int, total: int) -> None:
         """Show that `done` of `total` parts of the work `what` are done."""
@@ -73,7 +72,7 @@ class Whole:
         if speed is None or total <= 0:
             self.progress(what, done, total)
             return
-        parts = count_left(done, total, self.start) if what == TRAINING else max(0, total - done)
+        parts = count_left(done, total) if what == TRAINING else max(0, total - done)
         left = max(parts / speed + self.later, self.least())
         self.progress(f"{what} (about {format_duration(left)} left in all)", done, total)
 
@@ -82,24 +81,30 @@ def plan_training(width: int, height: int, views: int, have: float | None, slow:
     """Return a training for photographs of this size that takes `have` seconds; None: what `suggest`
     proposes, with FIRST of its iterations.
 
-    slow: How many times longer than estimated this machine takes.
+    slow: How many times longer than estimated this machine takes. On CUDA, where nothing is
+    estimated, how many times longer than `have` what `suggest` proposes takes.
     """
     limit = None if have is None else have / 60 / slow
     advice = suggest(width, height, views, limit=limit)
     if advice.minutes is None:
-        return advice
+        return advice if have is None else replace(advice, iterations=_within(advice.iterations / slow, views))
     if limit is None:
         iterations = round(FIRST * advice.iterations)
     else:
-        iterations = min(max(round(advice.iterations * limit / advice.minutes), LEAST), MOST_OF_FEW if views <= FEW else MOST)
+        iterations = _within(advice.iterations * limit / advice.minutes, views)
     return replace(advice, iterations=iterations, minutes=advice.minutes * iterations / advice.iterations)
 
 
-def find_slowness(iterations: int, step: int, seconds: float, minutes: float | None, have: float, start: int = 0) -> float | None:
+def _within(iterations: float, views: int) -> int:
+    """Iterations between the fewest and the most for so many photographs."""
+    return min(max(round(iterations), LEAST), MOST_OF_FEW if views <= FEW else MOST)
+
+
+def find_slowness(iterations: int, step: int, seconds: float, minutes: float | None, have: float) -> float | None:
     """Return how many times longer than the estimated minutes a training of `iterations` will take,
-    from the seconds of its first `step`. None where it will take about what it has. start: rows that
-    it starts from, 0: not known."""
-    expected = seconds * count_spent(1.0, start) / count_spent(max(step, 1) / iterations, start)
+    from the seconds of its first `step`; without an estimate, than `have`, the seconds that it has
+    from its first iteration on. None where it will take about what it has."""
+    expected = seconds * count_spent(1.0) / count_spent(max(step, 1) / iterations)
     if CLOSE[0] <= expected / max(have, 1e-9) <= CLOSE[1]:
         return None
     return expected / 60 / minutes if minutes else expected / max(have, 1e-9)

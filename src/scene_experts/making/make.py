@@ -35,7 +35,7 @@ from scene_experts.sfm.options import SfmOptions, SourceOptions
 from scene_experts.sfm.reconstruct import NOTE, check_request, reconstruct
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
-from scene_experts.training.events import Event, Started, Stepped
+from scene_experts.training.events import Event, Stepped
 from scene_experts.training.recipes import PROPOSED
 
 CAPTURE, RUN, PAGE, SOURCE = "capture", "run", "scene.html", "source.json"
@@ -209,6 +209,17 @@ class TrainingPlan:
         chosen = recipe(PROPOSED, iterations=advice.iterations, exposure=self.recipe.exposure)
         return replace(self, capture=capture, recipe=chosen, advice=advice, slow=slow)
 
+    def corrected(self, event: Stepped, left: float) -> TrainingPlan | None:
+        """Return another plan for the `left` seconds, if the speed until now says that this one takes
+        much more or less and the other one pays."""
+        minutes = self.advice.minutes if self.advice else None
+        slow = find_slowness(self.recipe.iterations, event.step, event.seconds, minutes, event.seconds + left)
+        if slow is None:
+            return None
+        other = self.fit(left, slow if minutes else slow * self.slow)
+        same = other.recipe.iterations == self.recipe.iterations and other.capture.data.resolution == self.capture.data.resolution
+        return other if not same and self.pays(other, event.step) else None
+
     def pays(self, other: TrainingPlan, step: int) -> bool:
         """Return whether another plan, begun now, ends sooner than this one from `step` on, or is
         for a machine that is faster than was known."""
@@ -271,25 +282,21 @@ def train(plan: TrainingPlan, folder: Path, budget: TimeBudget, progress: Whole,
     """
     settled = plan.begun
     while True:
-        have, other = budget.for_training(plan.held), None
-        begun, minutes = plan.begun, plan.advice.minutes if plan.advice else None
+        other: TrainingPlan | None = None
+        begun = plan.begun
         trainer = Trainer(plan.recipe, plan.capture, folder, resume=begun, overwrite=not begun, preview_every=0, save_every=SAVE_EVERY)
         recent: list[Stepped] = []
         for event in saved_when_interrupted(trainer):
-            if isinstance(event, Started):
-                progress.start = 0 if event.step else event.anchors
             if not isinstance(event, Stepped):
                 continue
             progress(TRAINING, event.step, plan.recipe.iterations)
             recent = [*(one for one in recent if event.step - one.step <= RECENT), event]
-            if not settled and have is not None and event.step >= LOOK * plan.recipe.iterations:
+            left = budget.for_training(plan.held)
+            if not settled and left is not None and event.step >= LOOK * plan.recipe.iterations:
                 settled = True
-                slow = find_slowness(plan.recipe.iterations, event.step, event.seconds, minutes, have, progress.start)
-                other = None if slow is None else plan.fit(budget.for_training(plan.held), slow)
-                if other and plan.pays(other, event.step):
+                other = plan.corrected(event, left)
+                if other:
                     trainer.stop("another training fits the time")
-                else:
-                    other = None
         if other is None:
             break
         how = "slower" if other.slow > plan.slow else "faster"

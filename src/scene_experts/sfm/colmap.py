@@ -19,7 +19,14 @@ from scene_experts.core.progress import Progress
 
 Say = Callable[[str], None]
 WORKER = "scene_experts.sfm.worker"
-ROOT = Path(__file__).parents[2]  # where it is found, whatever the paths of this process are
+ROOT = Path(__file__).parents[2]  # where it is found
+START = """
+import runpy, sys
+sys.path.insert(0, {root!r})
+import {worker}  # of the same version, whatever is installed
+del sys.path[0]  # where it is the folder of all packages, none may hide a standard module
+runpy.run_module({worker!r}, run_name="__main__")
+"""
 
 
 def run_worker(request: dict[str, Any], log: Path, say: Say, progress: Progress) -> dict[str, Any]:
@@ -28,7 +35,7 @@ def run_worker(request: dict[str, Any], log: Path, say: Say, progress: Progress)
     Raises InputError if pycolmap cannot be used, RunError if the worker fails.
     """
     environment = {**os.environ, "OMP_NUM_THREADS": str(request["threads"])}
-    start = f"import runpy, sys; sys.path.append({str(ROOT)!r}); runpy.run_module({WORKER!r}, run_name='__main__')"
+    start = START.format(root=str(ROOT), worker=WORKER)
     with log.open("a") as stream:
         # -P: modules are not searched in the current folder. In a new session, because this process
         # handles Ctrl-C.

@@ -19,30 +19,27 @@ from scene_experts.training.events import Densified, Event, Exported, Finished, 
 
 SMOOTHING = 0.9  # weight of the previous value in the running means of loss and PSNR
 
+GROWN = 0.6
+"""Iterations become this much longer on a CPU once a scene has grown, in the second half. A whole
+training takes 1.37 times ten first tenths then. Measured were 1.3 to 2.6 in eight trainings beside
+other work, 1.44 on bonsai beside another one, and without any 1.05 on South Building and 1.17 to 1.28
+in three on banana (results/to-page.md)."""
 
-GROWN = {0: 1.0, 26_000: 0.3}
-"""How much more an iteration costs on a CPU once a scene has grown, in the second half, by the number
-of rows that it starts from, at least. Whole trainings took 1.3 to 2.6 times ten first tenths in
-eight of banana, brighton, fern and kitchen, and 1.2 and 1.3 in two of banana on an idle machine,
-which start from few rows; 1.05 (South Building) and 1.44 (bonsai) from many."""
 
-
-def count_spent(share: float, start: int = 0) -> float:
-    """Return the cost of the first `share` of a training that starts from so many rows (0: not known),
-    in trainings of which no iteration grows."""
+def count_spent(share: float) -> float:
+    """Return the cost of the first `share` of a training. The unit is a whole training whose iterations
+    do not become longer."""
     if torch.cuda.is_available():  # not measured there: iterations count alike
         return share
-    grown = GROWN[max(least for least in GROWN if least <= start)]
-    return share + grown * (min(share, 0.5) ** 2 + max(0.0, share - 0.5))
+    return share + GROWN * (min(share, 0.5) ** 2 + max(0.0, share - 0.5))
 
 
-def count_left(step: int, total: int, start: int = 0) -> float:
+def count_left(step: int, total: int) -> float:
     """Return how many iterations as long as the present one are left. On the CPU those of a growing
-    scene become longer. start: as for `count_spent`."""
+    scene become longer."""
     if torch.cuda.is_available():
         return total - step
-    grown = GROWN[max(least for least in GROWN if least <= start)]
-    return total * (count_spent(1.0, start) - count_spent(step / total, start)) / (1 + grown * min(2 * step / total, 1.0))
+    return total * (count_spent(1.0) - count_spent(step / total)) / (1 + GROWN * min(2 * step / total, 1.0))
 
 
 class TrainingProgress:
@@ -61,7 +58,6 @@ class TrainingProgress:
     live: Live | None
     total: int
     first: int
-    start: int
     began: float
     printed: float
     loss: dict[str, float]
@@ -73,7 +69,7 @@ class TrainingProgress:
     def __init__(self, console: Console, every: float = 15.0, out: Path | None = None) -> None:
         self.console, self.every, self.out, self.pictured = console, every, out, False
         self.live = Live(console=console, refresh_per_second=4, transient=True) if console.is_terminal else None
-        self.total, self.first, self.start, self.began, self.printed = 0, 0, 0, time.perf_counter(), 0.0
+        self.total, self.first, self.began, self.printed = 0, 0, time.perf_counter(), 0.0
         self.loss, self.psnr = {}, None
         self.traits = Traits("", "rows")
         self.pace = Speedometer()
@@ -92,7 +88,6 @@ class TrainingProgress:
         match event:
             case Started():
                 self.total, self.first, self.began = event.total, event.step, time.perf_counter()
-                self.start = 0 if event.step else event.anchors
                 self.pace = Speedometer()
                 verb = f"resumed at iteration {event.step:,}" if event.step else "started"
                 self.traits, rows = event.traits, event.traits.rows
@@ -137,8 +132,7 @@ class TrainingProgress:
             self.loss[name] = SMOOTHING * self.loss.get(name, value) + (1 - SMOOTHING) * value
         self.psnr = event.psnr if self.psnr is None else SMOOTHING * self.psnr + (1 - SMOOTHING) * event.psnr
         speed = self.pace(event.step)
-        seconds = None if speed is None else count_left(event.step, self.total, self.start) / speed
-        left = "-:-- left" if seconds is None else f"{format_duration(seconds)} left  {speed:.1f} it/s"
+        left = "-:-- left" if speed is None else f"{format_duration(count_left(event.step, self.total) / speed)} left  {speed:.1f} it/s"
         terms = " ".join(f"{name} {value:.4f}" for name, value in self.loss.items())
         active = f"active {100 * event.active:.0f} %  " if self.traits.activation else ""
         line = (  # a narrow terminal cuts the end off

@@ -6,6 +6,7 @@ from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 from scene_experts.bench.advice import Advice
 from scene_experts.core import checkpoint
@@ -107,12 +108,19 @@ def test_scores_of_too_few_photographs_are_refused_before_the_training(capture, 
     assert not trained.made and not (tmp_path / "out" / "run").exists()
 
 
-def test_a_training_that_would_not_fit_begins_anew_with_other_iterations(capture, tmp_path, trained):
-    trained.Trainer.seconds = 0.1  # 1,000 iterations would take 159 s with growth
+def test_a_training_that_would_not_fit_begins_anew_with_other_iterations(capture, tmp_path, trained, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    trained.Trainer.seconds = 0.1  # 1,000 iterations would take 137 s with growth
     make(capture, tmp_path / "out", minutes=1.5, say=lambda _: None)
     first, second = trained.made
     assert first.stopped and not second.stopped
-    assert second.recipe.iterations == pytest.approx(82 / (159 / 60) * 10, rel=0.02)  # 8 of 90 s are the page's; 159 s for 1 min
+    assert second.recipe.iterations == pytest.approx(82 / (137 / 60) * 10, rel=0.02)  # 8 of 90 s are the page's; 137 s for 1 min
+
+
+def test_the_same_training_is_not_begun_anew(capture, tmp_path, trained, monkeypatch):
+    monkeypatch.setattr(making, "plan_training", lambda *_: Advice(0, 1000, None))
+    make(capture, tmp_path / "out", minutes=60.0, say=lambda _: None)
+    assert len(trained.made) == 1
 
 
 def test_a_training_is_not_begun_anew_for_one_that_ends_later(capture, tmp_path):

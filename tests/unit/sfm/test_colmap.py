@@ -16,11 +16,25 @@ from scene_experts.sfm import colmap
     ],
 )  # fmt: skip
 def test_a_failed_worker_is_reported(tmp_path, monkeypatch, code, error, fact):
-    (tmp_path / "made_worker.py").write_text(code)
+    (tmp_path / "made_worker").mkdir()
+    (tmp_path / "made_worker" / "__init__.py").touch()
+    (tmp_path / "made_worker" / "__main__.py").write_text(code)
     monkeypatch.setattr(colmap, "WORKER", "made_worker")
     monkeypatch.setattr(colmap, "ROOT", tmp_path)
     with pytest.raises(error, match=fact):
         colmap.run_worker({"threads": 1, "pairs": ["x" * 200] * 1000}, tmp_path / "colmap.log", lambda _: None, lambda *_: None)
+
+
+def test_the_worker_is_that_of_this_package(tmp_path, monkeypatch):
+    """Another version and a pycolmap that cannot be imported come first on the path."""
+    (tmp_path / "scene_experts" / "sfm").mkdir(parents=True)
+    for folder in (tmp_path / "scene_experts", tmp_path / "scene_experts" / "sfm"):
+        (folder / "__init__.py").touch()
+    (tmp_path / "scene_experts" / "sfm" / "worker.py").write_text('print(\'{"step": "done"}\')')
+    (tmp_path / "pycolmap.py").write_text("raise ImportError('made so')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with pytest.raises(InputError, match=r"pycolmap cannot be imported \(made so\)"):
+        colmap.run_worker({"threads": 1, "seed": 0}, tmp_path / "colmap.log", lambda _: None, lambda *_: None)
 
 
 def test_each_message_of_the_worker_is_told():

@@ -41,7 +41,7 @@ def test_the_worker_ends_when_its_parent_ends(tmp_path):
     (tmp_path / "pycolmap.py").write_text("import time\ndef set_random_seed(seed):\n    print('here', flush=True)\n    time.sleep(60)\n")
     code = "import os, subprocess, sys; p = subprocess.Popen([sys.executable, '-m', sys.argv[1]], stdin=subprocess.PIPE); " \
         "p.stdin.write(b'{\"seed\": 0}\\n'); p.stdin.flush(); print(p.pid, flush=True); import time; time.sleep(60)"  # fmt: skip
-    env = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])}
     parent = subprocess.Popen([sys.executable, "-c", code, WORKER], stdout=subprocess.PIPE, text=True, env=env)
     said = {parent.stdout.readline().strip(), parent.stdout.readline().strip()}
     parent.kill()
