@@ -21,9 +21,9 @@ SMOOTHING = 0.9  # weight of the previous value in the running means of loss and
 
 GROWN = 0.6
 """Iterations become this much longer on a CPU once a scene has grown, in the second half. A whole
-training takes 1.37 times ten first tenths then. Measured were 1.3 to 2.6 in eight trainings beside
-other work, 1.44 on bonsai beside one process, and without other work 1.05 on South Building and
-1.17 to 1.33 in five on banana (results/to-page.md)."""
+training takes 1.37 times ten first tenths then. Measured were 1.17 to 1.33 in five on banana without
+other work; beside other processes 1.05 on South Building, 1.44 on bonsai, and 1.3 to 2.6 in eight
+older trainings (results/to-page.md)."""
 
 
 def count_spent(share: float) -> float:
