@@ -52,10 +52,10 @@ def find(level: str) -> Path | None:
 def load(level: str | None = None) -> Library | None:
     """Load and bind the library for `level` (None: the best for this processor).
 
-    Returns None if no library is installed, or if it is damaged or has another interface
-    (`api.ABI_VERSION`).
+    Returns None if no library is installed, or if it is damaged, has another interface
+    (`api.ABI_VERSION`) or needs instructions that this processor lacks.
     """
-    for name in (level,) if level else list_levels():
+    for name in (name for name in list_levels() if level in (None, name)):
         path = find(name)
         if path is None:
             continue
@@ -76,7 +76,10 @@ def require(level: str | None = None) -> Library:
     returns None."""
     library = load(level)
     if library is None:
-        raise InputError(explain_missing() or f"the compiled CPU library for {level} is not installed: choose one of {', '.join(LEVELS)}")
+        raise InputError(
+            explain_missing()
+            or f"the compiled CPU library for {level} is not there or does not run here: choose one of {', '.join(list_levels())}"
+        )
     return library
 
 

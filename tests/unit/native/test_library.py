@@ -36,6 +36,18 @@ def test_a_loaded_library_fits_this_processor():
     assert native.load("no such level") is None and native.find("no such level") is None
 
 
+def test_a_library_for_other_processors_is_not_loaded(monkeypatch):
+    """It would end the process at its first instruction."""
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "DEFAULT")
+    native.load.cache_clear()
+    try:
+        assert native.load("avx512") is None and native.load("avx2") is None
+        with pytest.raises(InputError, match=r"(avx2 is not there or does not run here: choose one of portable|compiled CPU library)"):
+            native.require("avx2")
+    finally:
+        native.load.cache_clear()
+
+
 def test_a_missing_library_is_explained_in_one_sentence(elsewhere):
     assert native.load() is None and "pip install" in native.explain_missing()
 
