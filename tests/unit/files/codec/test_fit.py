@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from scene_experts.files.codec import fit
 from scene_experts.files.codec.fit import fit_models, one_thread, split
 from scene_experts.files.codec.groups import Walk, anchor_groups
 from scene_experts.files.codec.order import CodingOrder, choose_boxes
@@ -61,4 +60,4 @@ def test_one_thread_is_given_back():
     before = torch.get_num_threads()
     with one_thread():
         assert torch.get_num_threads() == 1
-    assert torch.get_num_threads() == before and fit.STEPS > 100
+    assert torch.get_num_threads() == before
