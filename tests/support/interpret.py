@@ -7,6 +7,7 @@ import subprocess
 import sys
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 import torch
 
@@ -18,7 +19,22 @@ def kernels(module: str = "scene_experts.scene.anchors.triton_kernels"):
     if DEVICE == "cpu":
         os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is defined
     pytest.importorskip("triton", reason="triton is not installed")
+    if DEVICE == "cpu":
+        multiply_by_value()
     return importlib.import_module(module)
+
+
+def multiply_by_value() -> None:
+    """Let the interpreter round each element of a product by its row and column alone, as a GPU does.
+
+    It calls BLAS, which on some processors rounds a row by its place in the block: then the same anchor in another block has other bits."""
+    interpreter = importlib.import_module("triton.runtime.interpreter")
+
+    def dot(self, a, b, d, input_precision, max_num_imprecise_acc):
+        product = np.einsum("ij,jk->ik", a.data, b.data, dtype=d.data.dtype)
+        return interpreter.TensorHandle(product + d.data, d.dtype.scalar)
+
+    interpreter.InterpreterBuilder.create_dot = dot
 
 
 def decode_by_triton(rows, xyz, feature, log_scaling, offsets, position, heads, with_dist, extent, outside, rounding=None):

@@ -35,7 +35,7 @@ FAMILIES = {
 }
 GROUPS = [list(LEAN)[:2], list(LEAN)[2:], *(list(FAMILIES)[i : i + 2] for i in range(0, len(FAMILIES), 2))]  # a process each
 CLOSE = 1e-4  # relative, of losses and gradients
-ROUNDING = 6e-7  # relative, of an alpha in float32: ten times that of one number
+ROUNDING = 3.3e-6  # relative, of an alpha at 1/255 in float32: ten roundings of 6e-8 of its exponent, up to ln 255
 PIXEL = 6e-7  # of a colour in [0, 1] in float32
 DRAWN = {"picture": 1e-5, "depth": 1e-5, "gradients": 1e-4}
 
