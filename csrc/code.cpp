@@ -54,6 +54,10 @@ CodeTables make_tables() {
         start[share] = static_cast<uint8_t>(s);
       }
     }
+  for (int i = 0; i <= kCodeTopScale; ++i) {  // wide ones have their low bits apart, and no phase
+    const int low = i < kCodeScales ? 0 : ((i - kCodeScales) >> 3) + 1, row = (i - 8 * low) * kCodePhases;
+    tables.scales[i] = {static_cast<uint16_t>(low ? row + 4 : row), static_cast<uint8_t>(low ? 0 : 7), static_cast<uint8_t>(low)};
+  }
   for (int i = 0; i <= kCodeTopOdds; ++i) {
     const int64_t least = tail(static_cast<int64_t>(std::abs(i - 64)) << (kFraction - 3));  // the share of the rarer bit
     const int64_t zeros = i <= 64 ? (int64_t{1} << kShare) - least : least;
@@ -70,16 +74,10 @@ struct Place {
   int low;
 };
 inline Place find_place(const CodeTables& tables, int32_t mean, int32_t scale) {
-  Place out;
-  out.centre = (mean + 4) >> 3;
-  int phase = mean - 8 * out.centre + 4;
-  scale = std::clamp(scale, 0, kCodeTopScale);
-  out.low = scale < kCodeScales ? 0 : ((scale - kCodeScales) >> 3) + 1;
-  if (out.low) phase = 4;
-  const int index = (scale - 8 * out.low) * kCodePhases + phase;
-  out.row = tables.below[index];
-  out.start = tables.start[index];
-  return out;
+  const CodeTables::Scale& of = tables.scales[std::clamp(scale, 0, kCodeTopScale)];
+  const int32_t centre = (mean + 4) >> 3;
+  const int index = of.row + ((mean - 8 * centre + 4) & of.phase);
+  return {tables.below[index], tables.start[index], centre, of.low};
 }
 constexpr int32_t kFarthest = 1 << 28;  // means are clamped to +- this
 }  // namespace

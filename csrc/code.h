@@ -1,6 +1,7 @@
 // The integer entropy coder of compact files (docs/compact-file.md): rANS with four states of 32 bits and words of 16 bits.
 // Everything here is integer arithmetic, so that every implementation of the format gives the same numbers.
 #pragma once
+#include <algorithm>
 #include <cstdint>
 #include <vector>
 
@@ -19,13 +20,18 @@ struct CodeTables {
   uint16_t below[kCodeScales * kCodePhases][kCodeSymbols + 1];  // cumulative frequencies, the last one 2^15
   uint8_t start[kCodeScales * kCodePhases][128];                // a symbol at or before the one of each share of 2^8
   uint16_t zeros[kCodeTopOdds + 1];                             // frequency of bit 0
+  struct Scale {
+    uint16_t row;  // of the first phase
+    uint8_t phase;  // mask of the phase
+    uint8_t low;    // bits that are stored as they are
+  } scales[kCodeTopScale + 1];
 };
 const CodeTables& code_tables();
 
 // One step of the coder: a share [start, start + width) of 2^15.
 inline uint32_t code_operation(uint32_t start, uint32_t width) { return start << 16 | width; }
 
-// Reads shares from words, at least one. `failed` is set where they end too early; what is read from there on means nothing.
+// Reads shares from words, at least one. `failed` where they end too early; what is read from there on means nothing.
 class CodeInput {
  public:
   CodeInput(const uint16_t* words, int64_t count, int64_t at, int64_t operations, const int64_t* state)
@@ -34,14 +40,15 @@ class CodeInput {
   }
   // The place in [0, 2^15) of the next share.
   uint32_t place() const { return state_[operations_ & (kCodeLanes - 1)] & ((1u << kCodeBits) - 1); }
-  // Leave the share that `place` lies in.
+  // Leave the share that `place` lies in. After a bit a word is rare. After a symbol it follows one time in four or so, and a branch on that
+  // would often be predicted wrongly.
+  template <bool rare = false>
   void take(uint32_t start, uint32_t width) {
     uint32_t& x = state_[operations_++ & (kCodeLanes - 1)];
     x = width * (x >> kCodeBits) + (x & ((1u << kCodeBits) - 1)) - start;
-    const bool more = x < kCodeFloor;  // without a branch, which would often be predicted wrongly
-    failed_ |= more && at_ >= count_;
-    const uint32_t word = words_[at_ < count_ ? at_ : count_ - 1];
-    x = more ? x << 16 | word : x;
+    const uint32_t more = x < kCodeFloor;
+    if (rare && !more) return;
+    x = x << (16 * more) | (words_[std::min(at_, count_ - 1)] & (0u - more));
     at_ += more;
   }
   uint32_t raw(int bits) {  // 1 .. 15
@@ -52,10 +59,10 @@ class CodeInput {
   }
   bool bit(uint32_t zeros) {
     const bool one = place() >= zeros;
-    take(one ? zeros : 0, one ? (1u << kCodeBits) - zeros : zeros);
+    take<true>(one ? zeros : 0, one ? (1u << kCodeBits) - zeros : zeros);
     return one;
   }
-  bool failed() const { return failed_; }
+  bool failed() const { return at_ > count_; }
   int64_t at() const { return at_; }
   int64_t operations() const { return operations_; }
   uint32_t state(int i) const { return state_[i]; }
@@ -64,7 +71,6 @@ class CodeInput {
   const uint16_t* words_;
   int64_t count_, at_, operations_;
   uint32_t state_[kCodeLanes];
-  bool failed_ = false;
 };
 
 // Collects operations, which `se_code_pack` turns into words.

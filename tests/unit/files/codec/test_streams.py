@@ -115,6 +115,11 @@ def test_contexts_are_those_of_the_reference():
     for numbers in ((1 << 27, 12, -5000, 9), (-77, -4, 3, 0), (0, 0, 1 << 28, -5)):
         for a, b in zip(streams.predict(inputs, D, weights, numbers, classes), reference.predict(inputs[:D], weights, numbers, classes)):
             assert np.array_equal(a, b)
+    weights[:, 3:40], weights[0, 40:50], weights[1, 45:60] = 0, 0, 0
+    for used, rows in ((D, 0), (D, 15), (D, 16), (D, 1041), (0, 40), (1, 40), (5, 40), (50, 40)):
+        some, few, its = np.ascontiguousarray(inputs[:, :rows]), weights[:, :used], classes[:rows]
+        found = streams.predict(some, used, few, (-77, 4, 3, 2), its), reference.predict(some[:used], few, (-77, 4, 3, 2), its)
+        assert all(np.array_equal(a, b) for a, b in zip(*found)), (used, rows)
     values = rng.integers(-(1 << 31), 1 << 31, n).astype(np.int32)
     values[: n // 2] >>= 20
     for factor, offset in ((1, 0), (1 << 20, -(1 << 28)), (700, 123456)):
