@@ -5,21 +5,16 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from statistics import fmean
 from time import monotonic
 from typing import Any
 
-import torch
-
-from scene_experts.api.capture import Capture, load_capture
-from scene_experts.api.recipe import Recipe, recipe
+from scene_experts.api.recipe import recipe
 from scene_experts.api.run import Run
 from scene_experts.api.trainer import Trainer
-from scene_experts.bench.advice import LIMIT, Advice
-from scene_experts.bench.machine import measure_share
-from scene_experts.core import checkpoint
+from scene_experts.bench.advice import LIMIT
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.fields import flag_of
 from scene_experts.core.io import read_json, write_json
@@ -28,13 +23,12 @@ from scene_experts.core.signals import handled
 from scene_experts.data.readers import is_capture
 from scene_experts.files.export import export_several
 from scene_experts.files.options import Options
-from scene_experts.making.budget import LEAST, LOOK, PAGE_GUESS, TRAINING, TimeBudget, Whole, find_slowness, guess_scores, plan_training
-from scene_experts.sfm.drift import drifts
+from scene_experts.making.budget import LOOK, PAGE_GUESS, TRAINING, TimeBudget, Whole, guess_scores
+from scene_experts.making.plan import TrainingPlan, prepare
 from scene_experts.sfm.lacking import explain_lacking
 from scene_experts.sfm.options import SfmOptions, SourceOptions
 from scene_experts.sfm.reconstruct import NOTE, check_request, reconstruct
 from scene_experts.training import run_folder
-from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Event, Stepped
 from scene_experts.training.recipes import PROPOSED
 
@@ -180,98 +174,6 @@ def expect_same(place: Path, options: SourceOptions) -> None:
             f"expected {flag} {before}, with which the poses in {place} were found, found {now}; give {flag} {before}, "
             f"or choose another --out"
         )
-
-
-@dataclass(frozen=True)
-class TrainingPlan:
-    """What is trained."""
-
-    place: Path
-    split: str
-    size: tuple[int, int]  # of the whole photographs, px
-    capture: Capture
-    recipe: Recipe
-    advice: Advice | None = None  # what was estimated
-    slow: float = 1.0  # times that the machine takes of it, as far as known
-    begun: bool = False  # by an earlier call
-
-    @property
-    def held(self) -> int:
-        """How many photographs are held out."""
-        return len(self.capture.test_cameras)
-
-    def fit(self, have: float | None, slow: float = 1.0) -> TrainingPlan:
-        """Return the plan for `have` seconds on a machine that takes `slow` times the estimate."""
-        views = len(self.capture.train_cameras)
-        advice = plan_training(*self.size, views, have, slow)
-        resolution = f"longest:{advice.side}" if advice.side else "auto"
-        capture = load_capture(self.place, split=self.split, resolution=resolution)
-        chosen = recipe(PROPOSED, iterations=advice.iterations, exposure=self.recipe.exposure)
-        return replace(self, capture=capture, recipe=chosen, advice=advice, slow=slow)
-
-    def corrected(self, event: Stepped, left: float) -> TrainingPlan | None:
-        """Return another plan for the `left` seconds, if the speed until now says that this one takes
-        much more or less and the other one pays."""
-        minutes = self.advice.minutes if self.advice else None
-        slow = find_slowness(self.recipe.iterations, event.step, event.seconds, minutes, event.seconds + left)
-        if slow is None:
-            return None
-        other = self.fit(left, slow if minutes else slow * self.slow)
-        same = other.recipe.iterations == self.recipe.iterations and other.capture.data.resolution == self.capture.data.resolution
-        return other if not same and self.pays(other, event.step) else None
-
-    def pays(self, other: TrainingPlan, step: int) -> bool:
-        """Return whether another plan, begun now, ends sooner than this one from `step` on, or is
-        for a machine that is faster than was known."""
-        if other.slow < self.slow or self.advice is None or self.advice.minutes is None or other.advice is None:
-            return True
-        return (other.advice.minutes or 0.0) < self.advice.minutes * (1 - step / self.recipe.iterations)
-
-
-def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Callable[[str], None]) -> TrainingPlan:
-    """Return what is trained: a run that has begun, or what fits the budget.
-
-    Raises InputError if the run in the folder was begun with other photographs held out, or if
-    scores are asked for and there are too few photographs to hold any out.
-    """
-    split = "auto" if scores else "none"  # auto: lists beside the poses, such as those of panoramas, else every 8th
-    if (folder / "config.json").is_file():
-        begun = run_folder.read_config(folder)
-        capture = load_capture(place, split=begun.data.split, resolution=begun.data.resolution, seed=begun.train.seed)
-        if bool(capture.test_cameras) is not scores:
-            told = "some were" if capture.test_cameras else "none was"
-            raise InputError(
-                f"expected a run with the same photographs held out in {folder}, found one where {told}; "
-                f"{'leave --scores out' if scores else 'add --scores'}, or choose another --out"
-            )
-        say(f"training: {describe_begun(folder, begun)}")
-        return TrainingPlan(place, begun.data.split, (0, 0), capture, begun.train, begun=True)
-    whole = load_capture(place, split=split)
-    if scores and not whole.test_cameras:
-        raise InputError(
-            f"expected photographs to hold out for --scores, found {len(whole.train_cameras)}, so few that all are trained on; "
-            "leave --scores out, the poses are kept"
-        )
-    lens = whole.cameras[0]
-    first = TrainingPlan(place, split, (lens.width, lens.height), whole, recipe(PROPOSED, exposure=drifts(place)))
-    share = measure_share(torch.get_num_threads())
-    plan = first.fit(budget.for_training(first.held), 1 / share)
-    held = f", {len(whole.test_cameras)} held out" if scores else ""
-    about = f", {told}" if plan.advice and (told := plan.advice.tell(share)) else ""
-    learned = ", their exposures" if plan.recipe.exposure else ""
-    least = " (the fewest; the time is too short for more)" if plan.recipe.iterations == LEAST else ""
-    what = f"{plan.recipe.iterations:,} iterations{least}, {plan.capture.data.resolution}, {len(whole.train_cameras)} photographs{learned}"
-    say(f"training: {plan.recipe.recipe}, {what}{held}{about}")
-    return plan
-
-
-def describe_begun(folder: Path, config: RunConfig) -> str:
-    """Say how far the training in a run folder is, and how to get another one."""
-    saved, iterations = checkpoint.latest(folder / "checkpoints"), config.train.iterations
-    step = 0 if saved is None else int(saved.stem.rpartition("_")[2])
-    state = f"that in {folder} is complete" if step >= iterations else f"continues that in {folder} at iteration {step:,}"
-    again = "remove that folder and repeat the command with other --minutes; the poses are kept"
-    return f"{state}: {iterations:,} iterations, {config.data.resolution}; to train anew, {again}"
 
 
 def train(plan: TrainingPlan, folder: Path, budget: TimeBudget, progress: Whole, say: Callable[[str], None]) -> tuple[Run, float | None]:

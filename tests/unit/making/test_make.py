@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from scene_experts.bench.advice import Advice
-from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
+from scene_experts.making import budget, plan
 from scene_experts.making import make as making
-from scene_experts.making.make import TrainingPlan, make
+from scene_experts.making.make import make
 from scene_experts.sfm.options import SfmOptions, SourceOptions
 from scene_experts.training.events import Stepped
 from scene_experts.training.recipes import PROPOSED
@@ -65,12 +65,12 @@ def trained(monkeypatch):
     monkeypatch.setattr(making, "export_several", export)
     monkeypatch.setattr(making.run_folder, "open_run", lambda folder: None)
 
-    def plan(width, height, views, have, slow=1.0):
+    def suggest(width, height, views, have, slow=1.0):
         iterations = 1000 if have is None or slow == 1 else round(have / slow * 10)
         return Advice(0, iterations, iterations / 1000)
 
-    monkeypatch.setattr(making, "plan_training", plan)
-    monkeypatch.setattr(making, "measure_share", lambda threads: 1.0)
+    monkeypatch.setattr(plan, "plan_training", suggest)
+    monkeypatch.setattr(plan, "measure_share", lambda threads: 1.0)
     return SimpleNamespace(made=made, Trainer=Trainer)
 
 
@@ -94,15 +94,15 @@ def test_scores_are_those_of_photographs_held_out(capture, tmp_path, trained):
 
 
 def test_the_fewest_iterations_are_told(capture, tmp_path, trained, monkeypatch):
-    monkeypatch.setattr(making, "plan_training", lambda *_: Advice(0, making.LEAST, 1.0))
+    monkeypatch.setattr(plan, "plan_training", lambda *_: Advice(0, budget.LEAST, 1.0))
     said = []
     make(capture, tmp_path / "out", minutes=1.0, say=said.append)
     assert any("300 iterations (the fewest; the time is too short for more), " in line for line in said)
 
 
 def test_scores_of_too_few_photographs_are_refused_before_the_training(capture, tmp_path, trained, monkeypatch):
-    given = making.load_capture
-    monkeypatch.setattr(making, "load_capture", lambda place, split, **more: given(place, split="none", **more))
+    given = plan.load_capture
+    monkeypatch.setattr(plan, "load_capture", lambda place, split, **more: given(place, split="none", **more))
     with pytest.raises(InputError, match=r"for --scores, found 9, so few that all are trained on; leave --scores out"):
         make(capture, tmp_path / "out", scores=True, say=lambda _: None)
     assert not trained.made and not (tmp_path / "out" / "run").exists()
@@ -118,23 +118,16 @@ def test_a_training_that_would_not_fit_begins_anew_with_other_iterations(capture
 
 
 def test_the_same_training_is_not_begun_anew(capture, tmp_path, trained, monkeypatch):
-    monkeypatch.setattr(making, "plan_training", lambda *_: Advice(0, 1000, None))
+    monkeypatch.setattr(plan, "plan_training", lambda *_: Advice(0, 1000, None))
     make(capture, tmp_path / "out", minutes=60.0, say=lambda _: None)
     assert len(trained.made) == 1
-
-
-def test_a_training_is_not_begun_anew_for_one_that_ends_later(capture, tmp_path):
-    whole = TrainingPlan(tmp_path, "none", (48, 32), None, SimpleNamespace(iterations=320), Advice(0, 320, 0.32))
-    shortest = replace(whole, advice=Advice(0, 300, 0.3), slow=4.0)
-    assert not whole.pays(shortest, 32) and whole.pays(shortest, 10)
-    assert whole.pays(replace(shortest, advice=Advice(0, 900, 0.9), slow=0.5), 32)
 
 
 def test_a_repeated_call_continues_the_training_and_keeps_the_page(capture, tmp_path, trained, monkeypatch):
     made = make(capture, tmp_path / "out", say=lambda _: None)
     begun = SimpleNamespace(data=SimpleNamespace(split="none", resolution="auto"), train=replace(trained.made[0].recipe, iterations=500))
     (made.run / "config.json").touch()
-    monkeypatch.setattr(making.run_folder, "read_config", lambda folder: begun)
+    monkeypatch.setattr(plan.run_folder, "read_config", lambda folder: begun)
     made.page.write_text("mine")
     make(capture, tmp_path / "out", say=lambda _: None)
     assert trained.made[1].resume and trained.made[1].recipe.iterations == 500 and made.page.read_text() == "mine"
@@ -189,12 +182,12 @@ def test_a_call_that_can_use_nothing_leaves_no_folder_and_a_killed_one_goes_on(t
 
 def test_what_counts_is_whether_photographs_are_held_out(tmp_path, capture, trained, monkeypatch):
     """Not the word of the split: with auto, few photographs are all trained on."""
-    given = making.load_capture
-    monkeypatch.setattr(making, "load_capture", lambda place, split, **more: given(place, split="none", **more))
+    given = plan.load_capture
+    monkeypatch.setattr(plan, "load_capture", lambda place, split, **more: given(place, split="none", **more))
     run = make(capture, tmp_path / "out", say=lambda _: None).run
     (run / "config.json").touch()
     begun = SimpleNamespace(data=SimpleNamespace(split="auto", resolution="auto"), train=trained.made[0].recipe)
-    monkeypatch.setattr(making.run_folder, "read_config", lambda folder: begun)
+    monkeypatch.setattr(plan.run_folder, "read_config", lambda folder: begun)
     make(capture, tmp_path / "out", say=lambda _: None)
     assert trained.made[1].resume
     with pytest.raises(InputError, match="leave --scores out"):
@@ -204,14 +197,6 @@ def test_what_counts_is_whether_photographs_are_held_out(tmp_path, capture, trai
 def test_a_capture_has_its_poses(capture, tmp_path):
     with pytest.raises(InputError, match="--panoramas"):
         make(capture, tmp_path / "out", options=SourceOptions(panoramas="keep"))
-
-
-def test_a_repeated_call_says_how_far_the_training_is(tmp_path):
-    config = SimpleNamespace(train=SimpleNamespace(iterations=500), data=SimpleNamespace(resolution="auto"))
-    assert "at iteration 0" in making.describe_begun(tmp_path, config)
-    checkpoint.save(tmp_path / "checkpoints", 500, {}, {})
-    told = making.describe_begun(tmp_path, config)
-    assert "is complete: 500" in told and "--minutes" in told and str(tmp_path) in told
 
 
 def test_an_interrupted_training_is_saved_first(capture, tmp_path, trained, monkeypatch):
