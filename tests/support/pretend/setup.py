@@ -26,7 +26,6 @@ from scene_experts.training.optim import FusedAdam
 from scene_experts.training.options import TrainOptions
 from scene_experts.training.recipes import RECIPES
 from support.captures import load
-from support.interpret import multiply_by_value
 from support.places import DEMO
 from support.pretend.tensors import Pretender, Pretending, counts
 
@@ -58,7 +57,6 @@ def run_of(cfg: Train, device: str) -> loop.Job:
 
 def prepare() -> None:
     """Change the package so that it finds gsplat and Triton, and counts their kernels."""
-    multiply_by_value()
     gsplat.explain_missing = gsplat_install.explain_missing = lambda: None
     photometric.TILE = 64  # the interpreter takes as long for a program of any size
     random.torch = SimpleNamespace(randint=torch.randint, Generator=lambda device: torch.Generator())
