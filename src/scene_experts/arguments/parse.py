@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field
+from pathlib import Path
 from typing import Any, TypeVar
 
 from scene_experts.arguments.help import format_usage, page, stands_for
@@ -116,11 +117,20 @@ class _Reader:
         left = [row for row in self.waiting if row.place not in self.given or count(row.kind)[1] is None]
         if not left:
             takes = " ".join(map(stands_for, self.waiting)) or "options"
-            raise InputError(f"expected only {takes} after `{self.command.name}`, found also '{args[0]}'; leave it out")
+            raise InputError(f"expected only {takes} after `{self.command.name}`, found also '{args[0]}'; {self._way_out(args[0])}")
         row = left[0]
         before = self.given.pop(row.place, ())  # the values of a list may precede and follow an option
         value = self._value(row, stands_for(row), _take(row, args))
         self._keep(row, stands_for(row), before + value if before else value)
+
+    def _way_out(self, word: str) -> str:
+        """What to do with a value too many: a list of files that a shell has made of a pattern has a
+        folder."""
+        folder = Path(word).parent
+        several = Path(word).is_file() and any(
+            isinstance(value, Path) and value.is_file() and value.parent == folder for value in self.given.values()
+        )
+        return f"give the folder {folder}" if several else "leave it out"
 
     def _value(self, row: Row, name: str, words: list[str]) -> Any:
         if "" in words:

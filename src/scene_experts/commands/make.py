@@ -31,10 +31,10 @@ class MakeCommand:
     out: Annotated[Path | None, Option(value="FOLDER")] = None
     """Folder to write; by default the name of PHOTOS with -scene, in this folder."""
     minutes: NotNegative = 0.0
-    """Time for the whole; it decides iterations, resolution and effort. 0: a training of at most 8
-    minutes on this machine if it is not busy."""
+    """Time for the whole; it decides iterations, resolution and effort. 0: half of the iterations
+    that `info` proposes."""
     scores: bool = False
-    """Hold out every 8th photograph, score it, and write a report. Otherwise all photographs are
+    """Hold out every 8th photograph of at least 12, score it, and write a report. Otherwise all photographs are
     trained on."""
     open: bool = False
     """Open the page in the browser at the end."""
@@ -77,6 +77,7 @@ def make(args: list[str]) -> int:
         say(f"report: {made.report}")
     size = made.page.stat().st_size / 1e6
     say(f"open {made.page} in a browser ({size:.1f} MB, one file to share)")
+    say(f"next: scene-experts export {made.run} --format sog --out scene.sog  # other files, of the run in {made.run}")
     if command.open:
         open_new_tab(made.page.resolve().as_uri())
     return 0

@@ -33,8 +33,10 @@ def open_scene(path: Path, device: str = "cpu", step: int | None = None, data: P
     """
     is_run = (path / "config.json").is_file() or (path / "checkpoints").is_dir()
     if not is_run and not (is_result(path) or scene_file(path).is_file()):
+        run = path / "run"  # of a folder that `make` wrote
         raise InputError(
-            f"expected a run folder with config.json, or a file or result folder of a scene, at {path}, found none; check the path"
+            f"expected a run folder with config.json, or a file or result folder of a scene, at {path}, found none; "
+            f"{f'give the run {run}' if (run / 'config.json').is_file() else 'check the path'}"
         )
     if is_run:
         return run_folder.with_capture(run_folder.open_run(path, device, step), data)

@@ -100,7 +100,7 @@ def cost(
     if capture is None or not views:
         where = f"the capture is not at {run.config.data.path} (say where it is with --data)"
         why = where if capture is None else why_no_views(capture)
-        return Cost(lines=(f"{why}: what the file costs in PSNR was not measured",))
+        return Cost(lines=(f"{why}: what the file costs on views that were not trained on was not measured",))
     drawn = {"run": (run.scene, run.step), **scenes()}
     painters = {name: Painter.of(scene, step, rasterize, run.config.train.antialias) for name, (scene, step) in drawn.items()}
     found = scores(painters, capture, views, tell, run.scene.as_photographed)

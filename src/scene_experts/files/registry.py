@@ -241,7 +241,7 @@ def _module(name: str) -> str:
     module = FORMATS.get(name) or _installed().get(name)
     if module is None:
         names = format_names()
-        raise InputError(f"expected a format among {', '.join(names)}, found '{name}'{nearest(name, names)}; choose one of them")
+        raise InputError(f"expected a format among {', '.join(names)}, found '{name}'{nearest(name, names) or '; choose one of them'}")
     return module
 
 

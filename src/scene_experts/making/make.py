@@ -20,6 +20,7 @@ from scene_experts.core.fields import flag_of
 from scene_experts.core.io import read_json, write_json
 from scene_experts.core.progress import Progress
 from scene_experts.core.signals import handled
+from scene_experts.data.match import EXTENSIONS
 from scene_experts.data.readers import is_capture
 from scene_experts.files.export import export_several
 from scene_experts.files.options import Options
@@ -27,6 +28,7 @@ from scene_experts.making.budget import LOOK, PAGE_GUESS, TRAINING, TimeBudget, 
 from scene_experts.making.plan import TrainingPlan, prepare
 from scene_experts.sfm.lacking import explain_lacking
 from scene_experts.sfm.options import SfmOptions, SourceOptions
+from scene_experts.sfm.photos import HEIC, list_files
 from scene_experts.sfm.reconstruct import NOTE, check_request, reconstruct
 from scene_experts.training import run_folder
 from scene_experts.training.events import Event, Stepped
@@ -119,25 +121,33 @@ def find_poses(source: Path, folder: Path, options: SourceOptions, say: Callable
 
     Raises InputError where the poses that are there were found in another way.
     """
+    if (source / SOURCE).is_file() and (source / CAPTURE).is_dir():
+        raise InputError(
+            f"expected photographs or a video, found {source}, which `make` wrote; give its photographs again, or its {source / CAPTURE}"
+        )
     if source.is_dir() and is_capture(source):
         if asked := list_changes(asdict(PLAIN), options):
             raise InputError(
                 f"expected photographs or a video with {asked[0][0]}, found the capture {source}, which has poses; leave it out"
             )
         return source
-    place, note, here = folder / CAPTURE, folder / SOURCE, str(source.resolve())
+    place, note, given = folder / CAPTURE, folder / SOURCE, describe_source(source, folder)
     if is_capture(place):
         made_of = read_json(note, "note of a scene") if note.is_file() else None
-        if made_of != {"source": here}:
-            raise InputError(
-                f"expected the scene of {here} in {folder}, found one of other photographs or of an unknown source; choose another --out"
-            )
+        made_of = made_of if isinstance(made_of, dict) else {}
+        files = made_of.get("files")
+        if made_of.get("source") != given["source"] and not (files and files == given["files"]):
+            other = f"that of {made_of['source']}" if "source" in made_of else "one of an unknown source"
+            raise InputError(f"expected the scene of {given['source']} in {folder}, found {other}; choose another --out")
         expect_same(place, options)
-        say(f"poses: those in {place}; after a change of the photographs, remove that folder and {folder / RUN}")
+        say(f"poses: those in {place}")
+        if isinstance(files, dict) and source.exists() and (changed := tell_changes(files, given["files"])):
+            anew = f"to make it anew, remove {place} and {folder / RUN} and repeat the command"
+            say(f"warning: since then {changed}; the scene is that of the earlier photographs; {anew}")
         return place
     check_request(source, place, overwrite=False)
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(note, {"source": here})  # before the capture: a call that is killed between the two goes on
+    write_json(note, given)  # before the capture: a call that is killed between the two goes on
     try:
         found = reconstruct(source, place, SfmOptions(**asdict(options)), few=recipe(PROPOSED).dense_views, say=say, progress=progress)
     except InputError:
@@ -147,6 +157,26 @@ def find_poses(source: Path, folder: Path, options: SourceOptions, say: Callable
     for line in explain_lacking(found, f"--matching exhaustive --out {folder}-2"):
         say(line)
     return place
+
+
+def describe_source(source: Path, folder: Path) -> dict[str, Any]:
+    """What tells photographs from others: their place, and the bytes of each file outside of `folder`,
+    by name."""
+    files = [source] if source.is_file() else list_files(source, folder) if source.is_dir() else []
+    kept = [path for path in files if path == source or path.suffix.lower() in (*EXTENSIONS, *HEIC)]
+    names = {path: path.name if path == source else path.relative_to(source).as_posix() for path in kept}
+    return {"source": str(source.resolve()), "files": {names[path]: path.stat().st_size for path in sorted(kept)}}
+
+
+def tell_changes(before: dict[str, Any], now: dict[str, int]) -> str:
+    """Say how many files are new, gone and changed; "" for none."""
+    counts = (
+        (len(now.keys() - before.keys()), "new"),
+        (len(before.keys() - now.keys()), "gone"),
+        (sum(before[name] != now[name] for name in before.keys() & now.keys()), "changed"),
+    )
+    found = [f"{many} {'photograph is' if many == 1 else 'photographs are'} {how}" for many, how in counts if many]
+    return " and ".join(found)
 
 
 def forget_empty(folder: Path, place: Path, note: Path) -> None:

@@ -14,6 +14,7 @@ from scene_experts.bench.advice import Advice
 from scene_experts.bench.machine import measure_share
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
+from scene_experts.data.prepare import FEW
 from scene_experts.making.budget import LEAST, TimeBudget, find_slowness, plan_training
 from scene_experts.sfm.drift import drifts
 from scene_experts.training import run_folder
@@ -89,7 +90,7 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
     whole = load_capture(place, split=split)
     if scores and not whole.test_cameras:
         raise InputError(
-            f"expected photographs to hold out for --scores, found {len(whole.train_cameras)}, so few that all are trained on; "
+            f"expected at least {FEW} photographs for --scores, found {len(whole.train_cameras)}, so few that all are trained on; "
             "leave --scores out, the poses are kept"
         )
     lens = whole.cameras[0]
@@ -110,5 +111,5 @@ def describe_begun(folder: Path, config: RunConfig) -> str:
     saved, iterations = checkpoint.latest(folder / "checkpoints"), config.train.iterations
     step = 0 if saved is None else int(saved.stem.rpartition("_")[2])
     state = f"that in {folder} is complete" if step >= iterations else f"continues that in {folder} at iteration {step:,}"
-    again = "remove that folder and repeat the command with other --minutes; the poses are kept"
-    return f"{state}: {iterations:,} iterations, {config.data.resolution}; to train anew, {again}"
+    again = f"--minutes does not change it; to train anew, remove {folder} and repeat the command, the poses are kept"
+    return f"{state}: {iterations:,} iterations, {config.data.resolution}; {again}"

@@ -9,6 +9,7 @@ import pytest
 from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import Command, HelpAsked, parse
 from scene_experts.core.errors import InputError
+from support.messages import naming
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,20 @@ def test_every_form_of_an_option():
 def test_one_sentence_for_each_mistake(args, facts):
     sentence = refuses(*args)
     assert all(fact in sentence for fact in facts), sentence
+
+
+def test_files_that_a_shell_made_of_a_pattern_have_a_folder(tmp_path):
+    @dataclass(frozen=True)
+    class One:
+        photos: Path
+
+    files = [tmp_path / "a.jpg", tmp_path / "b.jpg"]
+    for file in files:
+        file.touch()
+    with pytest.raises(InputError, match=naming(f"give the folder {tmp_path}")):
+        parse(One, Command("prog", ("photos",)), [*map(str, files)])
+    with pytest.raises(InputError, match="leave it out"):
+        parse(One, Command("prog", ("photos",)), [str(files[0]), str(tmp_path)])
 
 
 def test_words_of_a_list_may_stand_around_options():

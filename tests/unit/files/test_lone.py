@@ -60,3 +60,12 @@ def test_zips_and_folders_of_sog_are_files_too(file: Path, tmp_path: Path) -> No
         archive.extractall(tmp_path / "folder")
     (page,) = export(open_scene(tmp_path / "folder"), "html", tmp_path / "pages")
     assert page.path == tmp_path / "pages/folder.html" and page.rows == 50
+
+
+def test_the_folder_of_make_names_its_run(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.json").touch()
+    with pytest.raises(InputError, match=naming(f"give the run {tmp_path / 'run'}")):
+        open_scene(tmp_path)
+    with pytest.raises(InputError, match="check the path"):
+        open_scene(tmp_path / "nothing")

@@ -3,6 +3,7 @@
 import json
 import signal
 from dataclasses import asdict, replace
+from shutil import copytree
 from types import SimpleNamespace
 
 import pytest
@@ -154,8 +155,41 @@ def test_photographs_get_poses_first(tmp_path, capture, trained, monkeypatch):
     with pytest.raises(InputError, match=naming("--nadir 20.0")):
         make(tmp_path / "photos", tmp_path / "out", say=lambda _: None)
     (tmp_path / "others").mkdir()
-    with pytest.raises(InputError, match=naming(tmp_path / "others")):
+    with pytest.raises(InputError, match=naming(tmp_path / "others", tmp_path / "photos")):
         make(tmp_path / "others", tmp_path / "out", say=lambda _: None)
+    with pytest.raises(InputError, match=naming(tmp_path / "out" / "capture")):
+        make(tmp_path / "out", tmp_path / "again", say=lambda _: None)
+
+
+def test_photographs_that_changed_since_are_told_and_a_copy_of_them_goes_on(tmp_path, trained, monkeypatch):
+    def reconstruct(source, out, *_, **more):
+        make_capture(out, views=9, size=(48, 32), points=200)
+        return {"with_pose": 9, "photographs": 9, "points": 200, "without_pose": [], "apart": [], "all_compared": True}
+
+    monkeypatch.setattr(making, "reconstruct", reconstruct)
+    photos, said = tmp_path / "photos", []
+    photos.mkdir()
+    for name in "abc":
+        (photos / f"{name}.jpg").write_bytes(b"12")
+    (photos / "notes.txt").touch()
+    call = lambda source: make(source, tmp_path / "out", say=said.append)  # noqa: E731
+    call(photos)
+    copytree(photos, tmp_path / "moved")
+    call(photos)
+    call(tmp_path / "moved")
+    (photos / "notes.txt").unlink()
+    call(photos)
+    assert not any("since then" in line for line in said)
+    (photos / "a.jpg").unlink()
+    (photos / "b.jpg").write_bytes(b"123")
+    (photos / "d.JPG").touch()
+    (photos / "e.heic").touch()
+    call(photos)
+    (told,) = [line for line in said if "since then" in line]
+    assert "2 photographs are new and 1 photograph is gone and 1 photograph is changed;" in told and str(tmp_path / "out" / "run") in told
+    (tmp_path / "moved" / "a.jpg").unlink()
+    with pytest.raises(InputError, match=naming(tmp_path / "moved", photos)):
+        call(tmp_path / "moved")
 
 
 def test_a_call_that_can_use_nothing_leaves_no_folder_and_a_killed_one_goes_on(tmp_path, monkeypatch):
