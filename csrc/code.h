@@ -21,7 +21,7 @@ struct CodeTables {
   uint8_t start[kCodeScales * kCodePhases][128];                // a symbol at or before the one of each share of 2^8
   uint16_t zeros[kCodeTopOdds + 1];                             // frequency of bit 0
   struct Scale {
-    uint16_t row;  // of the first phase
+    uint16_t row;   // of the first phase
     uint8_t phase;  // mask of the phase
     uint8_t low;    // bits that are stored as they are
   } scales[kCodeTopScale + 1];
