@@ -7,9 +7,11 @@ from PIL import Image
 
 
 def write_photo(path, size=(40, 30), model="", focal=0.0):
-    """Write a black photograph with the camera's model and focal length in its EXIF data."""
+    """Write a black photograph with its name and the camera's model and focal length in its EXIF
+    data."""
     path.parent.mkdir(parents=True, exist_ok=True)
     exif = Image.Exif()
+    exif[0x010E] = path.name  # no other photograph has its bytes
     if model:
         exif[0x0110] = model
         exif.get_ifd(0x8769)[0x920A] = focal

@@ -210,7 +210,7 @@ def _assemble(root: Path, kind: str, raw: RawCapture, centred: bool, background:
         sources.append(FrameSource(image.path, lens, (flat.width, flat.height), masks.masks.get(image.name), turn, raw.alpha_over, white))
     train, test = (tuple(i for i, image in enumerate(posed) if image.test == held) for held in (False, True))
     return Capture(
-        name=root.resolve().name,
+        name=name_capture(root),
         root=root,
         kind=kind,
         views=tuple(views),
@@ -229,6 +229,13 @@ def _assemble(root: Path, kind: str, raw: RawCapture, centred: bool, background:
         applied=raw.applied,
         model=raw.model,
     )
+
+
+def name_capture(root: Path) -> str:
+    """Return what a capture is called: its folder, or the folder above one that `make` called
+    "capture"."""
+    here = root.resolve()
+    return here.parent.name if here.name == "capture" and here.parent.name else here.name
 
 
 def _add_random_points(capture: Capture, seed: int, warn: bool) -> Capture:

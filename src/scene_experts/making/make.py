@@ -21,14 +21,16 @@ from scene_experts.core.io import read_json, write_json
 from scene_experts.core.progress import Progress
 from scene_experts.core.signals import handled
 from scene_experts.data.match import EXTENSIONS
+from scene_experts.data.prepare import FEW
 from scene_experts.data.readers import is_capture
 from scene_experts.files.export import export_several
 from scene_experts.files.options import Options
 from scene_experts.making.budget import LOOK, PAGE_GUESS, TRAINING, TimeBudget, Whole, guess_scores
-from scene_experts.making.plan import TrainingPlan, prepare
+from scene_experts.making.plan import TrainingPlan, prepare, too_few
 from scene_experts.sfm.lacking import explain_lacking
 from scene_experts.sfm.options import SfmOptions, SourceOptions
-from scene_experts.sfm.photos import HEIC, list_files
+from scene_experts.sfm.panoramas import cuts
+from scene_experts.sfm.photos import HEIC, find_photos, list_files
 from scene_experts.sfm.reconstruct import NOTE, check_request, reconstruct
 from scene_experts.training import run_folder
 from scene_experts.training.events import Event, Stepped
@@ -97,6 +99,8 @@ def make(
     took: dict[str, float] = {}
     show, began = Whole(progress), monotonic()
     show.later, show.least = (PAGE_GUESS + 60 * LIMIT if minutes is None else PAGE_GUESS), lambda: budget.left or 0.0
+    if scores:
+        check_enough(source, folder, options)
     place = find_poses(source, folder, options, say, show)
     took["poses"], show.least = monotonic() - began, lambda: 0.0
     plan = prepare(place, folder / RUN, budget, scores, say)
@@ -114,6 +118,16 @@ def make(
     page = write_page(folder, Options(measure=False, title=source.resolve().stem), show)
     took["page"] = monotonic() - began
     return MadeScene(page, folder / RUN, place, report, psnr, took)
+
+
+def check_enough(source: Path, folder: Path, options: SourceOptions) -> None:
+    """Raise InputError if a folder has too few photographs to hold any out: before poses are sought,
+    which may take long. Panoramas have lists of views of their own."""
+    if not source.is_dir() or is_capture(source) or is_capture(folder / CAPTURE) or len(list_files(source, folder)) >= 2 * FEW:
+        return  # what is not known here is known when the poses are
+    found = find_photos(source, exclude=folder)
+    if len(found) < FEW and not cuts(found, SfmOptions(**asdict(options))):
+        raise too_few(len(found))
 
 
 def find_poses(source: Path, folder: Path, options: SourceOptions, say: Callable[[str], None], progress: Progress) -> Path:

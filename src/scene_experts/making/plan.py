@@ -89,10 +89,7 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
         return TrainingPlan(place, begun.data.split, (0, 0), capture, begun.train, begun=True)
     whole = load_capture(place, split=split)
     if scores and not whole.test_cameras:
-        raise InputError(
-            f"expected at least {FEW} photographs for --scores, found {len(whole.train_cameras)}, so few that all are trained on; "
-            "leave --scores out, the poses are kept"
-        )
+        raise too_few(len(whole.train_cameras))
     lens = whole.cameras[0]
     first = TrainingPlan(place, split, (lens.width, lens.height), whole, recipe(PROPOSED, exposure=drifts(place)))
     share = measure_share(torch.get_num_threads())
@@ -104,6 +101,12 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
     what = f"{plan.recipe.iterations:,} iterations{least}, {plan.capture.data.resolution}, {len(whole.train_cameras)} photographs{learned}"
     say(f"training: {plan.recipe.recipe}, {what}{held}{about}")
     return plan
+
+
+def too_few(photographs: int) -> InputError:
+    """Return the error of so few photographs that none can be held out for --scores."""
+    few = f"found {photographs}, so few that all are trained on"
+    return InputError(f"expected at least {FEW} photographs for --scores, {few}; leave --scores out")
 
 
 def describe_begun(folder: Path, config: RunConfig) -> str:

@@ -27,6 +27,7 @@ from scene_experts.native import library as native
 from scene_experts.sfm import frames, photos, work
 from scene_experts.sfm.attempts import find_poses, warn_of_mapper
 from scene_experts.sfm.colmap import Say, run_worker
+from scene_experts.sfm.copies import leave_copies_out
 from scene_experts.sfm.drift import KEY, NOTE, measure_drift
 from scene_experts.sfm.learned import attempt
 from scene_experts.sfm.learned.photographs import Shots
@@ -75,7 +76,7 @@ def reconstruct(
     """
     check_request(source, out, overwrite)
     attempt.check_features(options.features)
-    found = [] if source.is_file() else photos.find_photos(source, exclude=out, say=say)
+    found = [] if source.is_file() else find_different(source, out, say)
     with work.open_work_folder(out) as folder:
         check_request(source, out, overwrite)  # again: results of a killed process may just have been published
         own = source.resolve() == (out / "images").resolve()
@@ -94,7 +95,8 @@ def reconstruct(
         say(f"{said}, {len(pairs):,} pairs to match" if pairs is not None else said)
         masks = write_masks(found, images, folder / "masks")
         enough = ENOUGH_FOR_POSES if len(found) <= few and options.features != "learned" else None
-        prepare_folder(folder, found, options, masks, enough)
+        if prepare_folder(folder, found, options, masks, enough):
+            say("goes on from an earlier call of the same photographs, whose features and matches are kept")
         request = describe_request(folder, images, groups, rig, bool(masks), pairs, names, options)
         request |= {"enough": enough, "film": source.is_file() and rig is None}
         began = time.monotonic()
@@ -119,6 +121,14 @@ def reconstruct(
         work.publish(out)
     shutil.rmtree(out / work.NAME, ignore_errors=True)
     return note
+
+
+def find_different(source: Path, out: Path, say: Say) -> list[Photo]:
+    """Return the photographs of a folder outside of `out`, without copies, which are told."""
+    found, told = leave_copies_out(source, photos.find_photos(source, exclude=out, say=say))
+    if told:
+        say(told)
+    return found
 
 
 def write_facts(model: Path, images: Path, rig: PanoramaRig | None, result: dict[str, Any], note: dict[str, Any], place: Path) -> None:
@@ -253,9 +263,9 @@ def extract_photos(video: Path, images: Path, options: SfmOptions, say: Say, pro
     return photos.find_photos(images)
 
 
-def prepare_folder(folder: Path, found: list[Photo], options: SfmOptions, masks: list[str], enough: int | None) -> None:
+def prepare_folder(folder: Path, found: list[Photo], options: SfmOptions, masks: list[str], enough: int | None) -> bool:
     """Empty the work folder for this request. The database is kept if it holds features of the same
-    photographs and masks.
+    photographs and masks; returns whether it was.
 
     masks: Checksums of the masks. enough: Features of a photograph without the smallest ones.
     """
@@ -268,12 +278,14 @@ def prepare_folder(folder: Path, found: list[Photo], options: SfmOptions, masks:
     ]
     mark = hashlib.sha256(json.dumps(facts).encode()).hexdigest()
     database, note = folder / "database", folder / "database" / "of.txt"
-    if not note.is_file() or note.read_text() != mark:
+    kept = note.is_file() and note.read_text() == mark
+    if not kept:
         work.remove(database)
         database.mkdir(parents=True)
         note.write_text(mark)
     for left in (folder / "maps", folder / work.DONE / "model"):
         work.remove(left)
+    return kept
 
 
 def describe_result(

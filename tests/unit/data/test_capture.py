@@ -13,6 +13,7 @@ import torch
 from PIL import Image
 
 from scene_experts.core.errors import InputError
+from scene_experts.data.capture import name_capture
 from scene_experts.data.equirectangular import VIEWS
 from scene_experts.data.lens import Lens
 from scene_experts.data.readers.colmap_model import read_model, write_model
@@ -258,3 +259,8 @@ def test_few_photographs_are_all_trained_on(made: Synthetic, monkeypatch: pytest
     assert load(made.folder, split="mod8").test == (0, 8)
     monkeypatch.setattr("scene_experts.data.prepare.FEW", 10)
     assert load(made.folder).test == (0, 8)
+
+
+def test_the_capture_of_make_is_called_like_the_folder_above_it(tmp_path: Path) -> None:
+    assert name_capture(tmp_path / "statue-scene" / "capture") == "statue-scene"
+    assert name_capture(tmp_path / "statue") == "statue"

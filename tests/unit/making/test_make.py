@@ -18,6 +18,7 @@ from scene_experts.sfm.options import SfmOptions, SourceOptions
 from scene_experts.training.events import Stepped
 from scene_experts.training.recipes import PROPOSED
 from support.messages import naming
+from support.photos import write_black
 from support.synthetic import make_capture
 
 
@@ -107,6 +108,16 @@ def test_scores_of_too_few_photographs_are_refused_before_the_training(capture, 
     with pytest.raises(InputError, match=r"for --scores, found 9, so few that all are trained on; leave --scores out"):
         make(capture, tmp_path / "out", scores=True, say=lambda _: None)
     assert not trained.made and not (tmp_path / "out" / "run").exists()
+
+
+def test_scores_of_a_folder_with_too_few_photographs_are_refused_before_the_poses(tmp_path, trained, monkeypatch):
+    monkeypatch.setattr(making, "reconstruct", lambda *_, **more: pytest.fail("poses were sought"))
+    write_black(tmp_path / "photos", 11)
+    with pytest.raises(InputError, match=r"at least 12 photographs for --scores, found 11"):
+        make(tmp_path / "photos", tmp_path / "out", scores=True, say=lambda _: None)
+    assert not (tmp_path / "out").exists()
+    write_black(tmp_path / "photos", 12)
+    making.check_enough(tmp_path / "photos", tmp_path / "out", SourceOptions())
 
 
 def test_a_training_that_would_not_fit_begins_anew_with_other_iterations(capture, tmp_path, trained, monkeypatch):
