@@ -1,4 +1,4 @@
-// Tables and symbols of the entropy coder of compact files. The slow form is src/scene_experts/files/codec/reference.py.
+// Tables and writing of the entropy coder of compact files. The slow form is src/scene_experts/files/codec/reference.py.
 #include "code.h"
 
 #include <algorithm>
@@ -54,10 +54,6 @@ CodeTables make_tables() {
         start[share] = static_cast<uint8_t>(s);
       }
     }
-  for (int i = 0; i <= kCodeTopScale; ++i) {  // wide ones have their low bits apart, and no phase
-    const int low = i < kCodeScales ? 0 : ((i - kCodeScales) >> 3) + 1, row = (i - 8 * low) * kCodePhases;
-    tables.scales[i] = {static_cast<uint16_t>(low ? row + 4 : row), static_cast<uint8_t>(low ? 0 : 7), static_cast<uint8_t>(low)};
-  }
   for (int i = 0; i <= kCodeTopOdds; ++i) {
     const int64_t least = tail(static_cast<int64_t>(std::abs(i - 64)) << (kFraction - 3));  // the share of the rarer bit
     const int64_t zeros = i <= 64 ? (int64_t{1} << kShare) - least : least;
@@ -65,21 +61,6 @@ CodeTables make_tables() {
   }
   return tables;
 }
-
-// Where a symbol lies: its table, its centre, and how many low bits are stored as they are.
-struct Place {
-  const uint16_t* row;
-  const uint8_t* start;
-  int32_t centre;
-  int low;
-};
-inline Place find_place(const CodeTables& tables, int32_t mean, int32_t scale) {
-  const CodeTables::Scale& of = tables.scales[std::clamp(scale, 0, kCodeTopScale)];
-  const int32_t centre = (mean + 4) >> 3;
-  const int index = of.row + ((mean - 8 * centre + 4) & of.phase);
-  return {tables.below[index], tables.start[index], centre, of.low};
-}
-constexpr int32_t kFarthest = 1 << 28;  // means are clamped to +- this
 }  // namespace
 
 const CodeTables& code_tables() {
@@ -95,11 +76,12 @@ SE_EXPORT int64_t se_code_symbols(const int32_t* values, const int32_t* mean, co
   uint32_t* out = operations;
   const auto raw = [&](uint32_t value, int bits) { *out++ = code_operation(value << (kCodeBits - bits), 1u << (kCodeBits - bits)); };
   for (int64_t i = 0; i < count; ++i) {
-    const Place at = find_place(tables, std::clamp(mean[i], -kFarthest, kFarthest), scale[i]);
+    const CodePlace at = find_place(mean[i], scale[i]);
+    const uint16_t* row = tables.below[at.table];
     const int64_t away = static_cast<int64_t>(values[i]) - at.centre + ((int64_t{1} << at.low) >> 1), symbol = away >> at.low;
     const bool escapes = symbol < -kCodeHalf || symbol > kCodeHalf;
     const int entry = escapes ? kCodeSymbols - 1 : static_cast<int>(symbol) + kCodeHalf;
-    *out++ = code_operation(at.row[entry], at.row[entry + 1] - at.row[entry]);
+    *out++ = code_operation(row[entry], row[entry + 1] - row[entry]);
     if (escapes) {
       const uint64_t beyond = static_cast<uint64_t>(symbol < 0 ? -symbol : symbol) - kCodeHalf;  // 1 and more
       int bits = 0;
@@ -111,7 +93,8 @@ SE_EXPORT int64_t se_code_symbols(const int32_t* values, const int32_t* mean, co
         raw(static_cast<uint32_t>(beyond >> left & ((1u << part) - 1)), part);
       }
     }
-    if (at.low) raw(static_cast<uint32_t>(away & ((1 << at.low) - 1)), at.low);
+    *out = code_operation(static_cast<uint32_t>(away & ((1 << at.low) - 1)) << (kCodeBits - at.low), 1u << (kCodeBits - at.low));
+    out += at.low > 0;  // no branch: it would often be predicted wrongly
   }
   return out - operations;
 }
@@ -132,11 +115,12 @@ SE_EXPORT int64_t se_code_pack(const uint32_t* operations, int64_t count, uint16
   for (int64_t i = count; i-- > 0;) {
     uint32_t& x = state[i & (kCodeLanes - 1)];
     const uint32_t start = operations[i] >> 16, width = operations[i] & 0xFFFF;
-    if (x >= width << 17) {
-      *--out = static_cast<uint16_t>(x);
-      x >>= 16;
-    }
-    x = (x / width << kCodeBits) + x % width + start;
+    const uint32_t more = x >= width << 17;  // no branch: it would often be predicted wrongly
+    out[-1] = static_cast<uint16_t>(x);
+    out -= more;
+    x >>= 16 * more;
+    const uint32_t quotient = x / width;
+    x = (quotient << kCodeBits) + (x - quotient * width) + start;
   }
   for (int i = kCodeLanes; i-- > 0;) {
     *--out = static_cast<uint16_t>(state[i] >> 16);
@@ -145,71 +129,4 @@ SE_EXPORT int64_t se_code_pack(const uint32_t* operations, int64_t count, uint16
   const int64_t used = words + capacity - out;
   std::memmove(words, out, static_cast<size_t>(used) * sizeof(uint16_t));
   return used;
-}
-
-SE_EXPORT int32_t se_code_start(SeCodeReader* reader) {
-  if (reader->count < 2 * kCodeLanes) return kDamaged;
-  for (int i = 0; i < kCodeLanes; ++i) {
-    const uint32_t state = reader->words[2 * i] | static_cast<uint32_t>(reader->words[2 * i + 1]) << 16;
-    if (state < kCodeFloor) return kDamaged;
-    reader->state[i] = state;
-  }
-  reader->at = 2 * kCodeLanes;
-  reader->operations = 0;
-  return 0;
-}
-
-namespace {
-int32_t leave(SeCodeReader* reader, const CodeInput& input, bool failed) {
-  reader->at = input.at();
-  reader->operations = input.operations();
-  for (int i = 0; i < kCodeLanes; ++i) reader->state[i] = input.state(i);
-  return failed || input.failed() ? kDamaged : 0;
-}
-}  // namespace
-
-SE_EXPORT int32_t se_code_read(SeCodeReader* reader, const int32_t* mean, const int32_t* scale, int64_t count, int32_t* values) {
-  const CodeTables& tables = code_tables();
-  CodeInput input(reader->words, reader->count, reader->at, reader->operations, reader->state);
-  bool failed = false;
-  for (int64_t i = 0; i < count && !input.failed(); ++i) {
-    const Place at = find_place(tables, std::clamp(mean[i], -kFarthest, kFarthest), scale[i]);
-    const uint32_t share = input.place();
-    int entry = at.start[share >> 8];
-    while (at.row[entry + 1] <= share) ++entry;
-    input.take(at.row[entry], at.row[entry + 1] - at.row[entry]);
-    int64_t symbol = entry - kCodeHalf;
-    if (entry == kCodeSymbols - 1) {
-      const uint32_t form = input.raw(7);
-      const int bits = static_cast<int>(form >> 1);
-      if (bits > 32) {
-        failed = true;
-        break;
-      }
-      uint64_t beyond = 1;
-      for (int left = bits; left > 0;) {
-        const int part = std::min(left, kCodeBits);
-        left -= part;
-        beyond = beyond << part | input.raw(part);
-      }
-      symbol = static_cast<int64_t>(beyond) + kCodeHalf;
-      if (form & 1) symbol = -symbol;
-    }
-    int64_t value = symbol;
-    if (at.low) value = (symbol << at.low) + input.raw(at.low) - ((int64_t{1} << at.low) >> 1);
-    value += at.centre;
-    if (value < INT32_MIN || value > INT32_MAX) {
-      failed = true;
-      break;
-    }
-    values[i] = static_cast<int32_t>(value);
-  }
-  return leave(reader, input, failed);
-}
-
-SE_EXPORT int32_t se_code_read_bits(SeCodeReader* reader, const int32_t* odds, int64_t count, uint8_t* bits) {
-  const CodeTables& tables = code_tables();
-  CodeInput input(reader->words, reader->count, reader->at, reader->operations, reader->state);
-  for (int64_t i = 0; i < count && !input.failed(); ++i) bits[i] = input.bit(tables.zeros[std::clamp(odds[i], 0, kCodeTopOdds)]);
-  return leave(reader, input, false);
 }

@@ -13,6 +13,7 @@ constexpr int kCodeHalf = 40;                          // symbols -40 .. 40 have
 constexpr int kCodeSymbols = 2 * kCodeHalf + 2;        // and the escape
 constexpr int kCodeScales = 48, kCodePhases = 8;       // tables
 constexpr int kCodeTopScale = 127, kCodeTopOdds = 127;  // largest indices
+constexpr int32_t kCodeFarthest = 1 << 28;             // means are clamped to +- this
 constexpr uint32_t kCodeFloor = 1u << 16;              // least state
 constexpr int kDamaged = 2;                            // status: the bytes fit no symbols
 
@@ -20,13 +21,18 @@ struct CodeTables {
   uint16_t below[kCodeScales * kCodePhases][kCodeSymbols + 1];  // cumulative frequencies, the last one 2^15
   uint8_t start[kCodeScales * kCodePhases][128];                // a symbol at or before the one of each share of 2^8
   uint16_t zeros[kCodeTopOdds + 1];                             // frequency of bit 0
-  struct Scale {
-    uint16_t row;   // of the first phase
-    uint8_t phase;  // mask of the phase
-    uint8_t low;    // bits that are stored as they are
-  } scales[kCodeTopScale + 1];
 };
 const CodeTables& code_tables();
+
+// Where a symbol lies: its table, its centre, and how many low bits are stored as they are. A wide scale has low bits, and no phase.
+struct CodePlace {
+  int32_t table, centre, low;
+};
+inline CodePlace find_place(int32_t mean, int32_t scale) {
+  const int32_t m = std::clamp(mean, -kCodeFarthest, kCodeFarthest), s = std::clamp(scale, 0, kCodeTopScale), centre = (m + 4) >> 3;
+  const int32_t low = s < kCodeScales ? 0 : ((s - kCodeScales) >> 3) + 1;
+  return {(s - 8 * low) * kCodePhases + (low ? 4 : m - 8 * centre + 4), centre, low};
+}
 
 // One step of the coder: a share [start, start + width) of 2^15.
 inline uint32_t code_operation(uint32_t start, uint32_t width) { return start << 16 | width; }

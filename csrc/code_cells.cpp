@@ -46,9 +46,36 @@ struct Nodes {
   }
 };
 
+// What is known across the faces of the eight children of a node, a byte each: a state below kStates, made of x, y, z in turn by
+// `state = 4 state + side`. Every table is added to it.
+struct Sides {
+  uint64_t below[3][257];  // by the children of the node across the low face, 256: none
+  uint64_t above[3];       // where there is a node across the high face
+  uint64_t own[8];         // once a child is there
+};
+const Sides& sides() {
+  static const Sides tables = [] {
+    Sides out{};
+    for (int a = 0; a < 3; ++a)
+      for (int b = 0; b < 8; ++b) {
+        const int other = b ^ 1 << a;
+        const uint64_t unit = uint64_t{1} << (8 * b + 2 * (2 - a));
+        if (b >> a & 1) {
+          out.above[a] += unit;
+          out.own[other] += 2 * unit;
+        } else {
+          for (int children = 0; children < 256; ++children) out.below[a][children] += (1 + (children >> other & 1)) * unit;
+        }
+      }
+    return out;
+  }();
+  return tables;
+}
+
 // Walk the tree. `ask(level, share, key of the child)` codes one bit and returns it. False: more than `most` nodes.
 template <class Ask>
 bool walk(int depth, int64_t most, std::vector<uint64_t>* leaves, Ask&& ask) {
+  const Sides& known = sides();
   std::vector<Count> counts(size_t{kDepths} * 8 * kStates);
   Nodes now, next;
   now.keys.assign(1, 0);
@@ -62,23 +89,22 @@ bool walk(int depth, int64_t most, std::vector<uint64_t>* leaves, Ask&& ask) {
     for (size_t i = 0; i < n; ++i) {
       const int32_t* beside = now.beside.data() + 6 * i;
       now.first[i] = static_cast<int32_t>(next.keys.size());
+      uint64_t states = 0;
+      for (int a = 0; a < 3; ++a) {
+        states += known.below[a][beside[2 * a] < 0 ? 256 : now.children[beside[2 * a]]];
+        states += beside[2 * a + 1] < 0 ? 0 : known.above[a];
+      }
       unsigned own = 0;
       for (int b = 0; b < 8; ++b) {
         bool one = b == 7 && !own;  // a node has a child
         if (!one) {
-          int state = 0;
-          for (int a = 0; a < 3; ++a) {
-            const int high = b >> a & 1, other = b ^ 1 << a;
-            const int32_t node = beside[2 * a + high];
-            const int side = high ? 2 * (own >> other & 1) + (node >= 0) : node < 0 ? 0 : 1 + (now.children[node] >> other & 1);
-            state = 4 * state + side;
-          }
-          Count& count = counts[(left * 8 + b) * kStates + state];
+          Count& count = counts[(left * 8 + b) * kStates + (states >> 8 * b & 0xFF)];
           one = ask(level, count.share(), now.keys[i] << 3 | b);
           count.add(one);
         }
         if (one) {
           own |= 1u << b;
+          states += known.own[b];
           next.keys.push_back(now.keys[i] << 3 | b);
         }
       }

@@ -102,14 +102,11 @@ def arrange(data: AnchorData) -> Arranged:
     F, K = data.columns["feature"].shape[1], data.columns["offsets"].shape[1]
     if F > MOST_CHANNELS or K > MOST_SLOTS:
         raise InputError(f"expected at most {MOST_CHANNELS} channels and {MOST_SLOTS} Gaussians for a compact file, found {F} and {K}")
-    whole = round_scene(data)
     boxes = choose_boxes(places.keys)
     way = CodingOrder.of(places.keys, boxes)
     rows = along[way.rows]
-    values = {name: np.ascontiguousarray(value[:, rows]) for name, value in whole.values.items()}
-    return Arranged(
-        places.ordered(way.rows), rows, way, boxes, replace(whole, values=values), anchor_groups(F, K, SLOTS in values, len(whole.extra))
-    )
+    whole = round_scene(data, rows)
+    return Arranged(places.ordered(way.rows), rows, way, boxes, whole, anchor_groups(F, K, SLOTS in whole.values, len(whole.extra)))
 
 
 def encode(data: AnchorData) -> tuple[bytes, Sizes]:

@@ -112,7 +112,7 @@ def find_places(data: AnchorData) -> tuple[AnchorPlaces, NDArray[np.int64]]:
         corner = own.min(0)
         depth = int((own.max(0) - corner).max()).bit_length()
         x, y, z = corner.tolist()
-        distinct = len(np.unique(keys[lattice == i]))
+        distinct = len(_count_runs(np.sort(keys[lattice == i]))[0])
         lattices.append(Lattice(j, float(edges[j]), multiples[i], (x, y, z), len(own), distinct, depth))
     return AnchorPlaces(lattices, cells[order], lattice[order], keys[order]), order
 
@@ -133,11 +133,17 @@ def from_zero(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     return cells - low
 
 
+def _count_runs(keys: Keys) -> tuple[Keys, NDArray[np.int64]]:
+    """The different ones of ascending keys, and how many there are of each."""
+    first = np.flatnonzero(np.concatenate([np.ones(min(len(keys), 1), bool), keys[1:] != keys[:-1]]))
+    return keys[first], np.diff(first, append=len(keys))
+
+
 def write_places(places: AnchorPlaces, writer: SymbolWriter) -> None:
     """Append the cells of all lattices."""
     for i, lattice in enumerate(places.lattices):
         keys = morton(places.cells[places.lattice == i] - np.array(lattice.low))
-        distinct, counts = np.unique(keys, return_counts=True)
+        distinct, counts = _count_runs(np.sort(keys))
         writer.cells(distinct.astype(np.int64), lattice.depth)
         if lattice.distinct < lattice.count:
             writer.symbols((counts - 1).astype(np.int32), np.zeros(len(counts), np.int32), np.full(len(counts), STEP, np.int32))

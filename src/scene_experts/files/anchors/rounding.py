@@ -6,8 +6,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,6 +28,7 @@ FURTHER = {"interval": 0.02, "extra_level": 0.008}
 """Columns of one value, with their steps: the logarithm of an interval, and the share of a
 level."""
 _LEAST_INTERVAL = 1e-30
+ROWS = 4096  # anchors that are rounded together
 
 
 @dataclass(frozen=True)
@@ -45,26 +47,25 @@ class WholeScene:
     """Tensors that are held as they are."""
 
 
-def round_scene(data: AnchorData) -> WholeScene:
-    """The whole numbers of a scene. Raises InputError for values that are not finite or are too
-    large for their steps."""
-    p, c, n = data.precision or from_spread(data.columns, data.networks), data.columns, len(data.columns["xyz"])
-    classes = p.classes.cpu().numpy().astype(np.int32)
-    scale = 2.0 ** classes.astype(np.float64)
+def round_scene(data: AnchorData, rows: NDArray[Any] | None = None) -> WholeScene:
+    """The whole numbers of a scene, in the order of `rows` [N] if given. Raises InputError for values
+    that are not finite or are too large for their steps."""
+    p, n = data.precision or from_spread(data.columns, data.networks), len(data.columns["xyz"])
+    order = torch.arange(n) if rows is None else torch.from_numpy(np.asarray(rows, np.int64))
+    classes = p.classes.detach().cpu().to(torch.int32)[order]
     parts: dict[str, Ints] = {}
     for name in ROUNDED:
-        value = c[name].detach().cpu().double().reshape(n, math.prod(c[name].shape[1:])).numpy()
-        if not np.isfinite(value).all():
-            raise InputError(f"expected finite {name}, found others in {(~np.isfinite(value)).any(1).sum():,} anchors; train again")
-        parts[name] = _whole(value.T / p.steps[name].double().numpy()[:, None] / scale, name)
-    values = {CLASS: classes[None], FEATURE: parts["feature"], SCALING: parts["log_scaling"], OFFSETS: parts["offsets"]}
+        value = data.columns[name].detach().cpu().reshape(n, math.prod(data.columns[name].shape[1:]))
+        parts[name] = _round_rows(value, order, p.steps[name].cpu().double(), 2.0 ** classes.double(), name)
+    values = {CLASS: classes.numpy()[None], FEATURE: parts["feature"], SCALING: parts["log_scaling"], OFFSETS: parts["offsets"]}
+    c = {name: data.columns[name].detach().cpu()[order] for name in (*FURTHER, "slots") if name in data.columns}
     extra = [name for name in FURTHER if name in c]
     if extra:
-        further = {name: c[name].detach().cpu().double().numpy() for name in extra}
+        further = {name: c[name].double().numpy() for name in extra}
         further |= {"interval": np.log(np.maximum(further["interval"], _LEAST_INTERVAL))} if "interval" in extra else {}
         values[EXTRA] = np.stack([_whole(further[name] / FURTHER[name], name) for name in extra])
     if "slots" in c:
-        live = c["slots"].cpu().numpy().T
+        live = c["slots"].numpy().T
         values[SLOTS] = np.ascontiguousarray(live, np.int32)
         values[OFFSETS] = values[OFFSETS] * np.repeat(live, 3, 0)
     steps = {FEATURE: p.steps["feature"].tolist(), SCALING: p.steps["log_scaling"].tolist(), OFFSETS: p.steps["offsets"].tolist()}
@@ -81,11 +82,31 @@ def round_scene(data: AnchorData) -> WholeScene:
     return WholeScene(values, {name: [float(f"{s:.4g}") for s in found] for name, found in steps.items()}, extra, networks, exact)
 
 
+def _round_rows(value: Tensor, order: Tensor, steps: Tensor, scale: Tensor, what: str) -> Ints:
+    """The whole numbers [C, N] of rows `order` [N] of values [N, C], in steps [C] times scale [N], some
+    rows at a time, which stay in the cache."""
+    out = torch.empty((value.shape[1], len(order)), dtype=torch.int32)
+    for begin in range(0, len(order), ROWS):
+        few = slice(begin, begin + ROWS)
+        found = value.index_select(0, order[few]).t().contiguous().double()
+        found.div_(steps[:, None]).div_(scale[few]).round_()
+        least, most = (float(v) for v in found.aminmax())
+        if not math.isfinite(most - least):
+            raise InputError(f"expected finite {what}, found others in {(~value.isfinite()).any(1).sum():,} anchors; train again")
+        _check_size(max(-least, most), what)
+        out[:, few] = found
+    return out.numpy()
+
+
 def _whole(value: NDArray[np.float64], what: str) -> Ints:
     found = np.rint(value)
-    if np.abs(found).max(initial=0) > MOST_SYMBOL:
-        raise InputError(f"expected {what} below 2^30 of its steps for a compact file, found larger values; use --format anchors")
+    _check_size(np.abs(found).max(initial=0), what)
     return found.astype(np.int32)
+
+
+def _check_size(largest: float, what: str) -> None:
+    if largest > MOST_SYMBOL:
+        raise InputError(f"expected {what} below 2^30 of its steps for a compact file, found larger values; use --format anchors")
 
 
 def distance_exponent(data: AnchorData) -> int:
@@ -122,13 +143,8 @@ def restore(whole: WholeScene, data: AnchorData, shapes: Mapping[str, tuple[int,
     """The scene of whole numbers. data: everything else of it; its columns have at least xyz.
     shapes: of the networks' tensors. Raises Damaged for numbers that are no scene."""
     v, n = whole.values, len(data.columns["xyz"])
-    factor = np.float32(2.0) ** v[CLASS][0]
-    floats = {}
-    for name, steps in whole.steps.items():
-        value = v[name].astype(np.float32)
-        value *= np.array(steps, np.float32)[:, None]
-        value *= np.float32(1) if name == EXTRA else factor.astype(np.float32)
-        floats[name] = torch.from_numpy(np.ascontiguousarray(value.T))
+    scale = torch.from_numpy((np.float32(2.0) ** v[CLASS][0]).astype(np.float32))
+    floats = {name: _restore_rows(v[name], steps, None if name == EXTRA else scale) for name, steps in whole.steps.items()}
     columns = {"feature": floats[FEATURE], "log_scaling": floats[SCALING], "offsets": floats[OFFSETS].reshape(n, len(v[OFFSETS]) // 3, 3)}
     for i, name in enumerate(whole.extra):
         value = floats[EXTRA][:, i].clone()
@@ -147,6 +163,18 @@ def restore(whole: WholeScene, data: AnchorData, shapes: Mapping[str, tuple[int,
         if name not in networks or networks[name].dim() != 3 or not -networks[name].shape[2] <= column < networks[name].shape[2]:
             raise Damaged(f"networks without the column of the distance in {name}")
         networks[name][:, :, column] *= 2.0**exponent
+    return out
+
+
+def _restore_rows(whole: Ints, steps: Sequence[float], scale: Tensor | None) -> Tensor:
+    """The values [N, C] of whole numbers [C, N] in steps [C] times scale [N], some rows at a time, which
+    stay in the cache."""
+    given, own = torch.from_numpy(whole), torch.tensor(steps, dtype=torch.float32)[:, None]
+    out = torch.empty((given.shape[1], given.shape[0]))
+    for begin in range(0, len(out), ROWS):
+        few = slice(begin, begin + ROWS)
+        found = given[:, few].float().mul_(own)
+        out[few] = (found if scale is None else found.mul_(scale[few])).t()
     return out
 
 

@@ -32,10 +32,12 @@ def morton(cells: NDArray[np.int64]) -> Keys:
 def unmorton(keys: Keys) -> NDArray[np.int64]:
     """Cells [N, 3] of keys [N], the inverse of `morton`."""
     out = np.empty((len(keys), 3), np.int64)
-    masks = [0x1FFFFF, *(mask for _, mask in _SPREAD)]
+    masks, shifted = [0x1FFFFF, *(mask for _, mask in _SPREAD)], np.empty(len(keys), np.uint64)
     for axis in range(3):
-        value = (keys >> np.uint64(axis)) & np.uint64(_SPREAD[-1][1])
-        for i in range(len(_SPREAD) - 1, -1, -1):
-            value = (value | (value >> np.uint64(_SPREAD[i][0]))) & np.uint64(masks[i])
-        out[:, axis] = value.astype(np.int64)
+        value = keys >> np.uint64(axis)
+        value &= np.uint64(masks[-1])
+        for (shift, _), mask in zip(reversed(_SPREAD), reversed(masks[:-1])):
+            value |= np.right_shift(value, np.uint64(shift), out=shifted)
+            value &= np.uint64(mask)
+        out[:, axis] = value
     return out
