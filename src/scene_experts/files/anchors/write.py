@@ -232,7 +232,9 @@ def warnings(run: OpenRun) -> list[str]:
     scene = cast(AnchorScene, run.scene)
     plain = networks(scene, 1.0)
     facts, readers = scene.table.facts, "warning: other readers of the Scaffold-GS layout"
-    masked = [f"{readers} also draw Gaussians that this scene hides; files of other formats leave them out"] if "slots" in facts else []
+    hidden = int((~facts["slots"]).sum()) if "slots" in facts else 0
+    told = f"{readers} also draw the Gaussians that this scene hides ({hidden:,}); files of other formats leave them out"
+    masked = [told] if hidden else []
     masked += [f"{readers} draw without the smoothing filter"] if "interval" in facts else []
     if not is_plain(plain):
         return masked

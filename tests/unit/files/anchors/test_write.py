@@ -152,6 +152,16 @@ def test_single_networks_of_another_form_give_a_warning(monkeypatch):
     assert "color" in line and "opacity" not in line and "scaffold-gs" in line
 
 
+def test_masks_give_a_warning_only_where_they_hide_something():
+    run = run_in_memory("scaffold-gs")
+    slots = torch.ones(len(run.scene.positions), run.scene.K, dtype=torch.bool)
+    run.scene.table.facts["slots"] = slots
+    assert FAMILY.warnings(run) == []
+    slots[1, 2] = slots[3, 0] = False
+    (line,) = FAMILY.warnings(run)
+    assert "also draw the Gaussians that this scene hides (2);" in line
+
+
 def test_a_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "point_cloud").write_text("a file")
     with pytest.raises(RunError, match=naming("point_cloud.ply")):
