@@ -4,8 +4,9 @@
 //   const scene = await LayeredScene.open(await readCompact(coarse), plan);   // plan, chunks: Uint8Array
 //   for (const chunk of chunks) scene.take(chunk);
 //   scene.scene();   // as readCompact returns it, with the anchors that are here; after all chunks the whole scene
+//   expectPart(bytes, settings.parts[i]);   // whether bytes are part i of a page, before they are read
 //
-// Throws an Error for files that it does not read, and where the checksum of all numbers differs.
+// Throws an Error for files that it does not read, for parts of another page, and where the checksum of all numbers differs.
 import {
   CLASSES, LEVELS, LOW_CLASS, Reader, UNIT, bytesOf, clamp, compareMorton, crc32, fail, findParents, makeGroups, open, pick, readChannel, readModel,
   readPlaces,
@@ -46,6 +47,18 @@ function merge(coarse, more, lattices) {
   }
   const rows = Int32Array.from({ length: N }, (_, i) => i).sort((i, j) => compareMorton(fine, i, j) || lattice[i] - lattice[j] || i - j);
   return { rows, cells: pick(own, rows, Float64Array), fine: pick(fine, rows, Int32Array), lattice: Uint8Array.from(rows, (i) => lattice[i]), lattices: every };
+}
+
+// The error for a part that is not the one that its page lists. found: what differs.
+export const foreignPart = (name, found) =>
+  new Error(`expected the part ${name} that the page lists, found ${found}, so it belongs to another export or is damaged; copy the page and its folder of parts again, or export the run again`);
+
+// Throws unless bytes are the part that a page lists as [name, size, checksum]. The checksum is the CRC-32 of what is before the
+// last 4 bytes, which are that number too: the CRC-32 of all bytes would be the same for every part.
+export function expectPart(bytes, [name, size, checksum]) {
+  if (bytes.length !== size) throw foreignPart(name, `${bytes.length} bytes in place of ${size}`);
+  const last = size < 4 ? -1 : new DataView(bytes.buffer, bytes.byteOffset, size).getUint32(size - 4, true);
+  if (last !== checksum || crc32(bytes.subarray(0, -4)) !== checksum) throw foreignPart(name, "another checksum");
 }
 
 export class LayeredScene {

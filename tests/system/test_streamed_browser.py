@@ -134,8 +134,8 @@ def test_a_missing_or_damaged_part_is_a_sentence_and_what_is_here_stays(tmp_path
     with serving(tmp_path) as (address, _), browsers(GL, WIDTH, HEIGHT) as make:
         for broken, why in (
             (None, "404"),
-            (content[:-9], "ends after"),
-            (content[:-9] + b"123456789", "other bytes"),
+            (content[:-9], f"{len(content) - 9} bytes in place of {len(content)}"),
+            (content[:-9] + b"123456789", "another export"),
             (content + b"1", "more than"),
         ):
             third.unlink() if broken is None else third.write_bytes(broken)

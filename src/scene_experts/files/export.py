@@ -220,8 +220,9 @@ def _export_scene(work: ExportTask, out: Path | None) -> Written:
                 contents, fitted = format.fit(run, contents, trained, work.options, capture, work.rasterize, work.tell)
             note = _view_note(work, capture, world)
     detail = format.write(path, contents, note)  # type: ignore[misc]
-    rows, size = len(run.scene.positions), path.stat().st_size
-    said = f"{rows:,} {traits.rows}, {size / 1e6:.2f} MB with networks" + (f", {detail}" if detail is not None else "")
+    rows, size = len(run.scene.positions), path.stat().st_size if format.size is None else format.size(path)
+    said = f"{rows:,} {traits.rows}, {size / 1e6:.2f} MB with networks"
+    said += "" if detail is None else f"{', ' if format.size is None else ': '}{detail}"
     written = Written(path, size, rows, (f"wrote {path}", said, *fitted))
     if not work.options.measure or format.read is None:
         return written

@@ -89,6 +89,9 @@ class Format:
     with room for it. Returns what the terminal says about the file, or None. Raises InputError for
     contents that the format cannot hold and RunError when the disk is full. None: the result folder
     of the family."""
+    size: Callable[[Path], int] | None = None
+    """size(path): bytes of a file that `write` has made, with those of the files that belong to it.
+    None: it is one file."""
     read: Callable[[Path], Any] | None = None
     """read(path): the contents of a file. Raises InputError for a damaged file."""
     marks: tuple[bytes, ...] = ()

@@ -33,7 +33,7 @@ class Written:
     path: Path
     """The file, or the folder point_cloud/iteration_N of a result folder."""
     bytes: int
-    """Size of the file, or of the folder's files."""
+    """Size of the file with its parts, or of the folder's files."""
     rows: int
     """Anchors, Gaussians or points in it."""
     lines: tuple[str, ...]

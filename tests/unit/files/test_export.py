@@ -296,6 +296,18 @@ def test_a_page_is_baked_where_its_script_cannot_decode_the_scene(tmp_path):
         export_several(run_folder.open_run(tmp_path / "scaffold-gs"), ("html", "baked-html"), tmp_path / "out")
 
 
+def test_the_size_of_a_streamed_page_has_its_parts(tmp_path):
+    data = make_capture(tmp_path / "capture", views=5, size=(24, 16), points=60).folder
+    words = ["--data", str(data), "--iterations", "5", "--device", "cpu", "--preview-every", "0"]
+    assert main(["train", "scaffold-gs", "--out", str(tmp_path / "run"), *words]) == 0
+    (written,) = export_run(tmp_path / "run", "streamed-html", tmp_path / "s" / "index.html")
+    page = written.path.stat().st_size
+    parts = [part.stat().st_size for part in (tmp_path / "s" / "index.parts").iterdir()]
+    assert written.bytes == page + sum(parts)
+    said = f"page {page / 1e6:.2f}, {len(parts)} parts {sum(parts) / 1e6:.2f} in index.parts, "
+    assert f" anchors, {written.bytes / 1e6:.2f} MB with networks: {said}" in written.lines[1]
+
+
 def test_a_precision_that_no_format_has_is_refused_at_once(tmp_path):
     data = make_capture(tmp_path / "capture", views=4, size=(24, 16), points=60).folder
     words = ["--data", str(data), "--iterations", "20", "--device", "cpu", "--preview-every", "0"]

@@ -1,6 +1,6 @@
 // The program of `export --format streamed-html`: the coarse scene is shown as soon as it is here, and the parts behind it as they come.
-import { crc32, readCompact } from "../../../integrations/javascript/compact.mjs";
-import { LayeredScene } from "../../../integrations/javascript/layers.mjs";
+import { readCompact } from "../../../integrations/javascript/compact.mjs";
+import { LayeredScene, expectPart, foreignPart } from "../../../integrations/javascript/layers.mjs";
 import { boot } from "./boot.js";
 import { say } from "./page.js";
 import { sceneOf } from "./worker.js";
@@ -25,9 +25,9 @@ const acts = (use) => {
   };
 };
 
-// The bytes of a file. came(count): more of them are here.
-async function get(file, size, sum, came) {
-  const name = file.split("/").pop(), stop = new AbortController();
+// The bytes of a part in a folder. came(count): more of them are here.
+async function get(folder, part, came) {
+  const [name, size] = part, stop = new AbortController();
   let timer = 0, at = 0, out = null;
   const wait = () => {
     clearTimeout(timer);
@@ -35,13 +35,13 @@ async function get(file, size, sum, came) {
   };
   wait();
   try {
-    const answer = await fetch(file, { signal: stop.signal });
+    const answer = await fetch(`${encodeURIComponent(folder)}/${name}`, { signal: stop.signal });
     if (!answer.ok) throw new Error(`the server answered ${answer.status} for ${name}`);
     const reader = answer.body.getReader();
     out = new Uint8Array(size);
     for (let next = await reader.read(); !next.done; next = await reader.read()) {
       wait();
-      if (at + next.value.length > size) throw new Error(`${name} has more than ${size} bytes`);
+      if (at + next.value.length > size) throw foreignPart(name, `more than ${size} bytes`);
       out.set(next.value, at);
       at += next.value.length;
       came(next.value.length);
@@ -52,10 +52,13 @@ async function get(file, size, sum, came) {
   } finally {
     clearTimeout(timer);
   }
-  const why = at < size ? `${name} ends after ${at} of ${size} bytes` : crc32(out) !== sum ? `${name} has other bytes than the page expects` : "";
-  if (!why) return out;
-  came(-at);
-  throw new Error(why);
+  try {
+    expectPart(out.subarray(0, at), part);
+  } catch (error) {
+    came(-at);
+    throw error;
+  }
+  return out;
 }
 
 // A line in a corner of the page, with a button where something can be done.
@@ -79,10 +82,10 @@ async function load(page) {
   let here = 0, tell = null;
   const percent = () => `${Math.floor((100 * here) / total)} % of ${(total / 1e6).toFixed(1)} MB`;
   const came = (count) => ((here += count), tell ? tell(`loading: ${percent()}`) : say(`loading the scene: ${percent()}`));
-  const fetchPart = async ([name, size, sum]) => {
+  const fetchPart = async (part) => {
     for (let left = TRIES; ; await pause(PAUSE))
       try {
-        return await get(`${encodeURIComponent(folder)}/${name}`, size, sum, came);
+        return await get(folder, part, came);
       } catch (error) {
         if (--left <= 0) throw error;
       }

@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import re
 import zlib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_bytes
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.budget import CutShort, Damaged
 from scene_experts.core.reading.numbers import whole_number
-from scene_experts.core.reading.source import inside, opening
+from scene_experts.core.reading.source import Source, inside, opening
 from scene_experts.data.views import Capture, World
 from scene_experts.files.anchors import compact, layers, live
 from scene_experts.files.anchors.coarse import Layered, make_layers
@@ -37,6 +39,7 @@ FOLDER = ".parts"  # behind the name of the page without its suffix
 MORE = 1.075  # times the bytes of a compact file, at most about
 _NAME = re.compile(r"(coarse|plan|\d{2})-[0-9a-f]{8}\.bin")
 _MOST_PART = 1 << 40  # bytes
+_SUM = 4  # bytes of the CRC-32 that every part ends in
 
 
 def write(path: Path, contents: Layered, note: dict[str, Any]) -> str:
@@ -47,7 +50,7 @@ def write(path: Path, contents: Layered, note: dict[str, Any]) -> str:
     folder, listed = Path(path).with_suffix(FOLDER), []
     folder.mkdir(parents=True, exist_ok=True)
     for name, part in [("coarse", made.coarse), ("plan", made.plan), *((f"{i:02}", chunk) for i, chunk in enumerate(made.chunks))]:
-        checksum = zlib.crc32(part)
+        checksum = _checksum(part)
         listed.append([f"{name}-{checksum:08x}.bin", len(part), checksum])
         write_bytes(folder / listed[-1][0], part)
     settings = live.page_settings(contents.data, note)
@@ -56,8 +59,14 @@ def write(path: Path, contents: Layered, note: dict[str, Any]) -> str:
     for old in folder.iterdir():
         if _NAME.fullmatch(old.name) and old.name not in {name for name, *_ in listed}:
             old.unlink()
-    share = len(made.coarse) / made.size
-    return f"{made.size:,} bytes in {len(listed)} parts in {folder.name}, shown after {len(made.coarse):,} of them ({share:.0%})"
+    page, share = Path(path).stat().st_size, len(made.coarse) / made.size
+    return f"page {page / 1e6:.2f}, {len(listed)} parts {made.size / 1e6:.2f} in {folder.name}, shown after {share:.0%} of them"
+
+
+def size(path: Path) -> int:
+    """The bytes of a page that `write` has just made, and of its parts."""
+    parts = [part for part in Path(path).with_suffix(FOLDER).iterdir() if _NAME.fullmatch(part.name)]
+    return sum(file.stat().st_size for file in (Path(path), *parts))
 
 
 def read(path: Path) -> AnchorData:
@@ -65,22 +74,57 @@ def read(path: Path) -> AnchorData:
     parts that are missing or damaged."""
     with opening(path, budget.HTML) as source:
         settings = html.settings_in(source.read())
-        listed = [(str(name), whole_number(size, "the length of a part", 0, _MOST_PART)) for name, size, _ in settings["parts"]]
-        if len(listed) < 3 or not all(_NAME.fullmatch(name) for name, _ in listed):
+        listed = [_Part.listed(*entry) for entry in settings["parts"]]
+        if len(listed) < 3:
             raise Damaged("no list of parts")
         folder = inside(Path(path).parent, settings["folder"])
-    first, plan, *chunks = [folder / name for name, _ in listed]
-    with opening(first, budget.COMPACT) as source:
-        base = compact.decode_whole(source.read(), source)
-    with opening(plan, budget.COMPACT) as source:
-        scene = layers.LayeredScene(base, source.read(), source)
+    first, plan, *chunks = listed
+    with opening(folder / first.name, budget.COMPACT) as source:
+        base = compact.decode_whole(first.read(source, path), source)
+    with opening(folder / plan.name, budget.COMPACT) as source:
+        scene = layers.LayeredScene(base, plan.read(source, path), source)
     for chunk in chunks:
-        with opening(chunk, budget.COMPACT) as source:
-            scene.take(source.read())
-    with opening(plan, budget.COMPACT):
+        with opening(folder / chunk.name, budget.COMPACT) as source:
+            scene.take(chunk.read(source, path))
+    with opening(folder / plan.name, budget.COMPACT):
         if scene.taken < scene.chunks:
             raise CutShort("fewer chunks than the plan has")
         return scene.restored()
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A part as its page lists it."""
+
+    name: str
+    size: int
+    checksum: int
+
+    @classmethod
+    def listed(cls, name: Any, size: Any, checksum: Any) -> _Part:
+        """Raises Damaged for an entry that `write` does not make."""
+        if not isinstance(name, str) or not _NAME.fullmatch(name):
+            raise Damaged("no list of parts")
+        size = whole_number(size, "the length of a part", 0, _MOST_PART)
+        return cls(name, size, whole_number(checksum, "a checksum", 0, 0xFFFFFFFF))
+
+    def read(self, source: Source, page: Path) -> bytes:
+        """The bytes of the part. Raises InputError for others than the page lists."""
+        found = source.read()
+        last = int.from_bytes(found[-_SUM:], "little")
+        if len(found) == self.size and last == _checksum(found) == self.checksum:
+            return found
+        other = "another checksum" if len(found) == self.size else f"{len(found):,} bytes in place of {self.size:,}"
+        raise InputError(
+            f"expected the part of {page} that it lists at {source.path}, found {other}, so it belongs to another export or is damaged; "
+            "copy the page and its folder of parts again, or export the run again"
+        )
+
+
+def _checksum(part: bytes) -> int:
+    """The CRC-32 of the bytes before the last 4, which are that checksum already. The CRC-32 of all
+    bytes would be the same number for every part."""
+    return zlib.crc32(part[:-_SUM])
 
 
 def fit(
@@ -105,6 +149,7 @@ FORMAT = Format(
     suffix=".html",
     family="anchors",
     write=write,
+    size=size,
     read=read,
     marks=(b"<!doctype html>",),
     looks_like=lambda path, head: MARK in head,

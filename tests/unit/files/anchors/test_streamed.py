@@ -2,9 +2,13 @@
 
 import gzip
 import hashlib
+import json
 import re
+import shutil
+import subprocess
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -27,9 +31,10 @@ def page(tmp_path, monkeypatch):
     return tmp_path / "a.html"
 
 
-def write(path: Path, seed: int = 0) -> str:
+def write(path: Path, seed: int = 0, coarser: float = 1.0) -> str:
     data = contents_of(make_run("octree-gs"))
-    data = replace(data, precision=from_spread(data.columns, data.networks))
+    precision = from_spread(data.columns, data.networks)
+    data = replace(data, precision=replace(precision, steps={name: coarser * value for name, value in precision.steps.items()}))
     rows, coarse = make_coarse(data, seed=seed)
     return streamed.write(path, Layered(data, rows, coarse, torch.ones(len(data.columns["xyz"]))), {"title": "a scene"})
 
@@ -55,10 +60,77 @@ def test_the_page_lists_its_parts_and_reads_back(page, tmp_path):
 def test_parts_of_an_older_page_go_and_other_files_stay(page, tmp_path):
     before = {p.name for p in (tmp_path / "a.parts").iterdir()}
     (tmp_path / "a.parts" / "notes.txt").write_text("mine")
-    assert "in a.parts, shown after" in write(page, seed=1)
+    said, own = write(page, seed=1), page.stat().st_size
+    sizes = [size for _, size, _ in settings_of(page)["parts"]]
+    assert said.startswith(f"page {own / 1e6:.2f}, {len(sizes)} parts {sum(sizes) / 1e6:.2f} in a.parts, shown after")
+    assert streamed.size(page) == own + sum(sizes)
     after = {p.name for p in (tmp_path / "a.parts").iterdir()}
     assert after == {name for name, *_ in settings_of(page)["parts"]} | {"notes.txt"} and before != after
     streamed.read(page)
+
+
+def test_parts_of_other_content_have_other_names(tmp_path, monkeypatch):
+    monkeypatch.setattr(layers, "ANCHORS", 40)
+    for name, coarser in (("a", 1), ("b", 2), ("c", 1)):
+        write(tmp_path / f"{name}.html", coarser=coarser)
+    a, b, c = (settings_of(tmp_path / f"{name}.html")["parts"] for name in "abc")
+    assert len({checksum for _, _, checksum in (*a, *b)}) == len(a) + len(b) and a == c
+    assert all(name.endswith(f"-{checksum:08x}.bin") for name, _, checksum in a)
+
+
+def mix(folder: Path) -> list[tuple[list[Any], bytes]]:
+    """A second export, coarser, and for each part of the first one its entry and wrong bytes: those of that part of the second, and bytes
+    of the right length and with the right end."""
+    write(folder / "b.html", coarser=2)
+    own, other = settings_of(folder / "a.html")["parts"], settings_of(folder / "b.html")["parts"]
+    out = []
+    for entry, (foreign, *_) in zip(own, other):
+        name, size, checksum = entry
+        content = (folder / "b.parts" / foreign).read_bytes()
+        same = ((folder / "a.parts" / name).read_bytes() + content)[-size:]
+        out += [(entry, content), (entry, same[:-4] + checksum.to_bytes(4, "little"))]
+    return out
+
+
+SENTENCE = r"expected the part .*found .*belongs to another export or is damaged; copy the page and its folder of parts again, or export"
+
+
+def test_parts_of_another_export_are_refused(page, tmp_path):
+    for (name, *_), foreign in mix(tmp_path):
+        part = tmp_path / "a.parts" / name
+        content = part.read_bytes()
+        part.write_bytes(foreign)
+        with pytest.raises(InputError, match=SENTENCE) as caught:
+            streamed.read(page)
+        assert str(part) in str(caught.value) and str(page) in str(caught.value)
+        part.write_bytes(content)
+    streamed.read(page)
+
+
+PROGRAM = f"""
+import {{ readFileSync }} from "node:fs";
+import {{ expectPart }} from {json.dumps((ROOT / "integrations/javascript/layers.mjs").as_uri())};
+console.log(JSON.stringify(JSON.parse(readFileSync(0)).map(([path, part]) => {{
+  try {{ expectPart(new Uint8Array(readFileSync(path)), part); return ""; }} catch (error) {{ return error.message; }}
+}})));
+"""
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
+def test_the_reader_in_javascript_refuses_parts_of_another_export(page, tmp_path):
+    listed = settings_of(page)["parts"]
+    good, bad = [[str(tmp_path / "a.parts" / part[0]), part] for part in listed], []
+    for i, (entry, foreign) in enumerate(mix(tmp_path)):
+        (tmp_path / str(i)).write_bytes(foreign)
+        bad.append([str(tmp_path / str(i)), entry])
+    for i, short in enumerate((b"", b"abc")):
+        (tmp_path / f"short{i}").write_bytes(short)
+        bad += [[str(tmp_path / f"short{i}"), [name, size, 0]] for name, size in (("00-00000000.bin", len(short)), ("00-00000000.bin", 9))]
+    (tmp_path / "read.mjs").write_text(PROGRAM)
+    done = subprocess.run(["node", str(tmp_path / "read.mjs")], input=json.dumps(good + bad), capture_output=True, text=True, check=True)
+    found = json.loads(done.stdout)
+    assert found[: len(good)] == [""] * len(good) and all(re.match(SENTENCE, said) for said in found[len(good) :])
+    assert all(part[0] in said for said, (_, part) in zip(found[len(good) :], bad))
 
 
 def test_missing_damaged_and_foreign_parts_are_one_sentence(page, tmp_path):
@@ -76,6 +148,7 @@ def test_missing_damaged_and_foreign_parts_are_one_sentence(page, tmp_path):
         (b'"folder": "a.parts"', b'"folder": ".."'),
         (b'"coarse-', b'"/etc/coarse-'),
         (b'"parts": [', b'"parts": [1, '),
+        (b'"parts": [[', b'"parts": [["00-00000000.bin", 9, -1], ['),
     ):
         assert old in text
         page.write_bytes(text.replace(old, new))
