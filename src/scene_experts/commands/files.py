@@ -120,10 +120,14 @@ def import_(args: list[str]) -> int:
     brought = {"data.normalise": defaults_in(args).normalise}
     command = parse(ImportCommand, Command(f"{PROG} import", ("source",), FIRST, text, brought), args)
 
+    from scene_experts.api.command_line import changes, words_of
     from scene_experts.files.importing import import_files
-    from scene_experts.training.run_folder import named
+    from scene_experts.training.run_folder import named, read_config
 
-    print(f"wrote {import_files(command.source, named(command.data), command.out, command.iteration, command.transform)}")
+    asked = named(command.data)
+    print(f"wrote {import_files(command.source, asked, command.out, command.iteration, command.transform)}")
+    if own := [word for place, value in changes(asked, read_config(command.out).data) or [] for word in words_of(place, value)]:
+        print(f"read as its training did, by {shlex.join(own)}; give other values to choose otherwise")
     print(f"next: {shlex.join([PROG, 'eval', str(command.out)])}")
     return 0
 

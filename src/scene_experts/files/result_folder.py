@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -103,6 +104,18 @@ def check_description(value: dict[str, Any]) -> None:
 def data_in(about: Mapping[str, Any]) -> Data:
     """How the capture was read, as far as a description says it; without the capture's path."""
     return from_json(Data, {**about.get("data", {}), "path": ""}, "data")
+
+
+DRAWN = ("resolution", "background", "near")
+"""Settings of a capture that a scene was trained for: with others it looks different."""
+
+
+def drawn_as(data: Data, about: Mapping[str, Any]) -> Data:
+    """The settings of a capture where those of `DRAWN` that have their default are as a description
+    says that the scene was trained."""
+    own = data_in(about)
+    asked = {f.name: getattr(data, f.name) != f.default for f in fields(Data) if f.name in DRAWN}
+    return replace(data, **{name: getattr(own, name) for name in DRAWN if not asked[name]})
 
 
 def world_in(about: dict[str, Any]) -> World:

@@ -7,6 +7,7 @@ import json
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -80,6 +81,7 @@ def test_every_command_reads_a_scene_alike(
     assert se.Trainer("scaffold-gs", capture.path).recipe.scene.voxel_size == 0
     asked = []
     monkeypatch.setattr("scene_experts.files.importing.import_files", lambda source, data, out, *_: asked.append(data))
+    monkeypatch.setattr("scene_experts.training.run_folder.read_config", lambda out: SimpleNamespace(data=asked[-1]))
     assert cli.main(["import", "a.ply", "--data", "catalog:truck", "--out", str(tmp_path / "imported")]) == 0
     assert asked == [capture.data]
 

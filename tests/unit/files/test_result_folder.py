@@ -1,12 +1,15 @@
 """Result folders: iterations, descriptions, worlds; cfg_args is read as literals, and nothing in it is evaluated."""
 
 import json
+from pathlib import Path
 
 import pytest
 
 from scene_experts.core.errors import InputError
+from scene_experts.data.settings import Data
 from scene_experts.data.views import World
 from scene_experts.files.result_folder import (
+    drawn_as,
     expect_world,
     is_result,
     iteration_folder,
@@ -121,3 +124,10 @@ def test_another_world_is_refused():
     for other in (World(2.6, world.shift), World(2.5, (1.01, -20.0, 3.0))):
         with pytest.raises(InputError, match="--normalise"):
             expect_world(world, other)
+
+
+def test_a_capture_is_read_as_the_training_read_it_unless_others_are_asked_for():
+    about = {"data": {"resolution": "longest:800", "background": [0.5, 0.4, 0.3], "near": 1.5, "split": "none"}}
+    found = drawn_as(Data(Path("x"), near=0.1), about)
+    assert found == Data(Path("x"), resolution="longest:800", background=(0.5, 0.4, 0.3), near=0.1)
+    assert drawn_as(Data(Path("x")), {}) == Data(Path("x"))

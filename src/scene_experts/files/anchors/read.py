@@ -72,7 +72,7 @@ def _read(source: Path, data: Data | None) -> Imported:
         places = world.seen_from(origin).from_input(found.columns["xyz"].double())
         capture = place_cameras(source, places, world, origin, data.background)
     else:
-        data = data if about is not None else replace(data, normalise="none")
+        data = replace(data, normalise="none") if about is None else result_folder.drawn_as(data, about)
         capture = captures.load(data)
         capture.images.close()
     if about is None:

@@ -67,6 +67,7 @@ def _read(source: Path, data: Data | None) -> Imported:
         data = data_in(about)
         capture = place_cameras(source, tensors["facts.xyz"].double(), world, origin_in(about), data.background)
     else:
+        data = result_folder.drawn_as(data, about)
         capture = captures.load(data)
         capture.images.close()
         expect_world(world, capture.world)
