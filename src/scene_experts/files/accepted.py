@@ -37,7 +37,7 @@ def check_values(options: Options) -> None:
     if not 0 < options.quality < math.inf:
         raise InputError(f"expected --quality above 0 dB, found {options.quality}; 0.2 is usual")
     if not 0 <= options.target_mb < math.inf:
-        raise InputError(f"expected --target-mb as megabytes above 0, found {options.target_mb}; correct it")
+        raise InputError(f"expected --target-mb as megabytes, 0 for none, found {options.target_mb}; correct it")
     if options.target_mb and options.quality != DEFAULT.quality:
         raise InputError("expected --quality or --target-mb, found both; leave one out")
     if not 0 <= options.prune < 1:

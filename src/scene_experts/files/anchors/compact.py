@@ -146,7 +146,8 @@ def encode_arranged(data: AnchorData, found: Arranged) -> tuple[bytes, Sizes]:
         "scene": data.about,
     }
     encoded = container.join(header, parts)
-    return encoded, Sizes(len(encoded), {name: len(part) for name, part in parts.items()}, len(found.rows))
+    told = {name: len(part) for name, part in parts.items() if name != EXACT or whole.exact}
+    return encoded, Sizes(len(encoded), told, len(found.rows))
 
 
 def checksum(places: AnchorPlaces, whole: WholeScene) -> int:
@@ -171,6 +172,9 @@ def read(path: Path) -> AnchorData:
         head = source.head(4096)
         if not head.startswith(container.MARK) and head[8:9] == b"{" and b"compact scene" in head:
             raise InputError(f"expected a compact file of version {VERSION} at {path}, found version 1; export its run again")
+        if head.startswith(container.MARK[:6]) and not head.startswith(container.MARK):
+            other = head[6:7].decode(errors="replace")
+            raise InputError(f"expected a compact file of version {VERSION} at {path}, found version {other}; export its run again")
         return decode(source.read(), source)
 
 

@@ -24,7 +24,7 @@ from scene_experts.files.anchors.rounding import rounded
 from scene_experts.files.anchors.sensitivity import keep, kept, measure
 from scene_experts.files.measure import LOSS, Painter, Tell
 from scene_experts.files.options import Options
-from scene_experts.files.placed import place_cameras
+from scene_experts.files.placed import AROUND, place_cameras
 from scene_experts.files.scene_folder import origin_of
 from scene_experts.render import Rasterizer, as_trained, choose
 from scene_experts.scene import Scene
@@ -36,10 +36,12 @@ from scene_experts.training.sensitivity import MOST_VIEWS, evenly
 VIEWS = 16  # that judge a precision
 FEW = 4  # of them, that find about where it lies
 START = -40.0  # first guess of log2 of the mean square error that every value adds
+FINEST, COARSEST = -60.0, 0.0  # places that are tried: beyond, nothing is lost that 8 bits show, or nothing is left
 ROUNDS = 10
 UNKNOWN_ERROR = 10**-3.2  # mean square error of pictures without photographs: that of 32 dB
 WORST_ERROR = 10**-2.6  # of a scene with 26 dB: what a worse one may lose is as if it had these
 MEGABYTE = 1_000_000
+UNJUDGED = "no photographs say what may be lost, so all values keep fine steps; --data CAPTURE makes a smaller file, by --quality"
 NETWORKS = 0.1  # share of the loss that networks may have where a training has rounded the other values
 
 
@@ -66,6 +68,21 @@ class Judge:
         """Whether the loss is that against photographs. Without them it is estimated from the
         difference between the pictures, as if the run had 32 dB."""
         return len(self.capture.images) > 0
+
+    @property
+    def who(self) -> str:
+        """What the views are called."""
+        if self.has_photographs:
+            return "training views"
+        return AROUND if self.capture.kind == AROUND else f"cameras of {self.capture.kind}"
+
+    @property
+    def caveat(self) -> str:
+        """What limits the loss, as the end of a sentence."""
+        if self.has_photographs:
+            return ""
+        far = "; nearer views may lose many times as much" if self.capture.kind == AROUND else ""
+        return f" (estimated, without photographs{far})"
 
     def _painter(self, scene: Scene, step: int) -> Painter:
         return Painter.of(scene, step, self.rasterize, self.run.config.train.antialias)
@@ -117,9 +134,11 @@ def _shows(capture: Capture, index: int) -> bool:
     return mask is None or bool(mask.any())
 
 
-def search(value: Callable[[float], float], wanted: float, start: float, slope: float, close: float) -> float | None:
-    """A place u where an increasing function is at most `wanted` and at least `close` times it, or
-    the largest place with at most `wanted` that was tried; None: there is none.
+def search(
+    value: Callable[[float], float], wanted: float, start: float, slope: float, close: float, least: float = FINEST, most: float = COARSEST
+) -> float | None:
+    """A place u, `least` to `most`, where an increasing function is at most `wanted` and at least
+    `close` times it, or the largest place with at most `wanted` that was tried; None: there is none.
 
     start: the first place. slope: about how much log2 of the function rises with u.
     """
@@ -137,7 +156,8 @@ def search(value: Callable[[float], float], wanted: float, start: float, slope: 
         guess = at + max(-8.0, min(8.0, math.log2(max(0.5 * (1 + close) * wanted, 1e-12) / max(found, wanted / 64, 1e-12)) / slope))
         if low is not None and high is not None and not low + 0.1 * (high - low) < guess < high - 0.1 * (high - low):
             guess = 0.5 * (low + high)
-        if low is not None and high is not None and high - low < 0.02:
+        guess = max(least, min(most, guess))
+        if guess == at or (low is not None and high is not None and high - low < 0.02):
             break
         at = guess
     return low
@@ -160,6 +180,12 @@ def with_learned(precision: Precision, scene: AnchorScene) -> Precision:
     if scene.steps is None or CLASS not in scene.table.facts:
         return precision
     return replace(precision, steps=scene.steps.by_column(scene.config.F), classes=scene.table.facts[CLASS].cpu(), learned=True)
+
+
+def explain_smallest(asked: float, smallest: float, learned: bool) -> str:
+    """The error of a scene that does not fit into the size [MB] that was asked for."""
+    more = ", or train with a larger --rate" if learned else ""
+    return f"expected a --target-mb that this scene fits into, found {asked:g}; the smallest file has {smallest:.3f} MB, give more{more}"
 
 
 def choose_precision(
@@ -187,31 +213,34 @@ def choose_precision(
             draws = as_trained(rasterize or choose("auto", "cpu"), run.config.train.antialias)
             precision = measure(cast(AnchorScene, run.scene), run.step, cameras, torch.tensor(views.background), draws, tell)
             keep(run, precision)
+        if views.kind == AROUND and not options.target_mb:
+            return contents, [UNJUDGED]
         unit, quality = with_learned(precision, cast(AnchorScene, run.scene)), options.quality
         if unit.learned:
             quality *= NETWORKS
+        also = "; the training (--rate) has fixed the steps of all values but the networks'" if unit.learned else ""
         judge = Judge(run, world.seen_from(origin_of(run, world)), views, rasterize)
 
         @cache
         def loss(at: float, most: int = VIEWS) -> float:
             return judge.loss(rounded(contents, unit.at(2.0**at)), most)
 
+        @cache
+        def sized(at: float) -> int:
+            return size(replace(contents, precision=unit.at(2.0**at)))
+
         if options.target_mb:
             wanted = options.target_mb * MEGABYTE
-            place = search(lambda u: size(replace(contents, precision=unit.at(2.0**-u))), wanted, -START - 2, 0.12, 0.98)
+            place = search(lambda u: sized(-u), wanted, -START - 2, 0.12, 0.98, -COARSEST, -FINEST)
             if place is None:
-                more = ", or train with a larger --rate" if unit.learned else ""
-                raise InputError(
-                    f"expected a --target-mb that this scene fits into, found {options.target_mb:g}; give a larger number{more}"
-                )
+                raise InputError(explain_smallest(options.target_mb, sized(COARSEST) / MEGABYTE, unit.learned))
             at = -place
         else:
             start = search(lambda at: loss(at, FEW), quality, START, 1.0, 0.85) if len(judge.views) > 2 * FEW else None
             found = search(loss, quality, START if start is None else start, 1.0, 0.85)
-            at = START - 30 if found is None else found
-        lost, against = loss(at), "" if judge.has_photographs else " (estimated, without photographs)"
-        also = "; values have the steps that the training learned" if unit.learned else ""
-        lines = [f"{len(judge.views)} training views lose {lost:.3f} dB{against}{also}"]
+            at = FINEST if found is None else found
+        lost = loss(at)
+        lines = [f"{len(judge.views)} {judge.who} lose {lost:.3f} dB{judge.caveat}{also}"]
         if lost > LOSS:
             asked = "a larger --target-mb" if options.target_mb else "a smaller --quality"
             lines.append(f"warning: values are rounded so coarsely that pictures change; ask for {asked}")

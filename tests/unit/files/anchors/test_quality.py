@@ -23,7 +23,7 @@ from scene_experts.files.options import Options
 from support.files import run_in_memory
 
 
-@pytest.mark.parametrize("start", [-60.0, -40.0, 10.0])
+@pytest.mark.parametrize("start", [-60.0, -40.0, 0.0])
 def test_the_search_ends_near_the_wanted_value(start):
     tried = []
 
@@ -37,8 +37,11 @@ def test_the_search_ends_near_the_wanted_value(start):
 
 def test_steps_and_functions_without_a_place():
     assert search(lambda u: 5.0, 0.1, 0.0, 1.0, 0.85) is None
-    found = search(lambda u: 0.0 if u < 3 else 1.0, 0.5, 0.0, 1.0, 0.85)
-    assert 2 < found < 3
+    found = search(lambda u: 0.0 if u < -3 else 1.0, 0.5, 0.0, 1.0, 0.85)
+    assert -4 < found < -3
+    tried = []
+    assert search(lambda u: tried.append(u) or 0.0, 0.5, -10.0, 1.0, 0.85) == quality.COARSEST and max(tried) == quality.COARSEST
+    assert search(lambda u: 2.0**u, 1e-30, -50.0, 1.0, 0.85) is None
     assert math.isfinite(search(lambda u: -1.0, 0.5, 0.0, 1.0, 0.85))
 
 
@@ -54,6 +57,10 @@ def test_a_file_without_photographs_gets_a_wanted_loss_or_size(tmp_path, monkeyp
     about = describe(run, World()) | {"train": to_json(run.config.train)}
     compact.write(tmp_path / "a.compact", contents(run, World(), about), {})
     opened = open_scene(tmp_path / "a.compact")
+    for loss in (0.01, 1.0):  # cameras around a scene say too little
+        (written,) = export(opened, "compact", tmp_path / "kept.compact", Options(measure=False, quality=loss))
+        assert written.lines[-1] == quality.UNJUDGED
+    monkeypatch.setattr(quality, "AROUND", "as if the cameras were those of the photographs")
     sizes = []
     for loss in (0.01, 1.0):
         (written,) = export(opened, "compact", tmp_path / f"{loss}.compact", Options(measure=False, quality=loss))
@@ -63,7 +70,9 @@ def test_a_file_without_photographs_gets_a_wanted_loss_or_size(tmp_path, monkeyp
     wanted = 0.5 * sum(sizes) / 1e6
     (written,) = export(opened, "compact", tmp_path / "b.compact", Options(measure=False, target_mb=wanted))
     assert written.bytes <= wanted * 1e6 and written.bytes > 0.9 * wanted * 1e6
-    with pytest.raises(InputError, match="--target-mb"):
+    (written,) = export(opened, "compact", tmp_path / "d.compact", Options(measure=False, target_mb=1000.0))
+    assert "lose 0.000 dB" in written.lines[-1]
+    with pytest.raises(InputError, match=r"--target-mb .*the smallest file has 0\.\d+ MB"):
         export(opened, "compact", tmp_path / "c.compact", Options(measure=False, target_mb=0.0001))
 
 
