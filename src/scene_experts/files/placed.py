@@ -84,7 +84,7 @@ def _rings(positions: Tensor) -> dict[str, Camera]:
     centre; up is -y, as in captures with OpenCV axes."""
     centre, radius = torch.zeros(3, dtype=torch.float64), 1.0
     if len(positions):
-        centre = positions.median(0).values
+        centre = positions.contiguous().median(0).values  # torch 2.13 reads beside an expanded tensor
         radius = float((positions - centre).norm(dim=1).sort().values[int(0.9 * (len(positions) - 1))]) or 1.0
     away = MARGIN * radius / math.sin(math.radians(FOV / 2))
     up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)

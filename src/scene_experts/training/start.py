@@ -21,6 +21,7 @@ from scene_experts.training.state import Training, resume
 
 log: logging.Logger = logging.getLogger(__name__)
 
+MUCH = 0.02  # of --rate
 ENOUGH = 26_000
 """Points of a capture with which a recipe does not start densely: twice what the sweep brings. With
 13,633 (fox) it gains, with 74,177 (bonsai) it loses detail (results/default.md)."""
@@ -46,6 +47,8 @@ def begin(cfg: Train, run: Job, capture: Capture, folder: Path | None) -> Traini
     training = training or start(cfg, run.config.data, capture, run.device, run.dtype)
     if unused := find_unused(cfg):
         log.warning("these options have no effect with this recipe: %s; leave them out", ", ".join(unused))
+    if cfg.rate > MUCH:
+        log.warning("--rate %g makes bits count so much that little may be left of the scene; 0.0005 to 0.002 is usual", cfg.rate)
     training.capture_id, training.poses, training.chosen = capture.fingerprint(), capture.poses(), capture.chosen()
     if uses_depth(cfg, capture):
         told = sum(capture.views[i].depth is not None for i in capture.train)

@@ -81,3 +81,11 @@ def test_the_loss_of_depth_moves_the_scene_to_the_depth_of_the_maps(tmp_path):
         drawn = draw(training.scene(camera, 150, Mode.DRAW, draw.visible).gaussians, camera, torch.zeros(3))
         found.append(depth_error(drawn.depth, drawn.alpha, capture.depth(2)).item())
     assert found[1] < 0.7 * found[0]
+
+
+def test_a_rate_that_leaves_little_of_the_scene_is_told(tmp_path, caplog):
+    folder = make_planes(tmp_path / "planes", plane(4.0))
+    next(events(config("scaffold-gs", rate=0.002), folder, stop_at=1))
+    assert "--rate" not in caplog.text
+    next(events(config("scaffold-gs", rate=100.0), folder, stop_at=1))
+    assert "--rate 100 makes bits count so much" in caplog.text
