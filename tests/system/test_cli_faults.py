@@ -126,9 +126,9 @@ def test_a_disk_that_fills_up_while_making_a_capture(tmp_path):
     """Photographs that cannot be copied, and a database that COLMAP cannot write: no capture, and the photographs are unchanged."""
     pytest.importorskip("pycolmap")
     (tmp_path / "photos").mkdir()
-    noise = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+    noise = np.random.default_rng(0)
     for name in "abc":
-        Image.fromarray(noise).save(tmp_path / "photos" / f"{name}.png")
+        Image.fromarray(noise.integers(0, 255, (48, 64, 3), np.uint8)).save(tmp_path / "photos" / f"{name}.png")
     photos, out = contents(tmp_path / "photos"), tmp_path / "made"
     size = max(map(len, photos.values()))
     for limit in (size // 2, size + 1000):

@@ -167,14 +167,13 @@ def checksum(places: AnchorPlaces, whole: WholeScene) -> int:
 
 def read(path: Path) -> AnchorData:
     """The scene in a file. Raises InputError for a missing, damaged or other file and for one of
-    version 1."""
+    another version."""
     with opening(path, budget.COMPACT) as source:
         head = source.head(4096)
-        if not head.startswith(container.MARK) and head[8:9] == b"{" and b"compact scene" in head:
-            raise InputError(f"expected a compact file of version {VERSION} at {path}, found version 1; export its run again")
-        if head.startswith(container.MARK[:6]) and not head.startswith(container.MARK):
-            other = head[6:7].decode(errors="replace")
-            raise InputError(f"expected a compact file of version {VERSION} at {path}, found version {other}; export its run again")
+        older = head[8:9] == b"{" and b"compact scene" in head
+        if not head.startswith(container.MARK) and (older or head.startswith(container.MARK[:6])):
+            found = "1" if older else head[6:7].decode(errors="replace")
+            raise InputError(f"expected a compact file of version {VERSION} at {path}, found version {found}; export its run again")
         return decode(source.read(), source)
 
 

@@ -151,6 +151,9 @@ def test_truncated_damaged_and_other_files(tmp_path):
     checkpoint.write_tensors(path, {"cells": torch.zeros(3)}, "compact scene", 1, {"N": 1})
     with pytest.raises(InputError, match=naming(path, "version 1", "export its run again")):
         read(path)
+    (tmp_path / "later.compact").write_bytes(b"SXCOMP3" + data[7:])
+    with pytest.raises(InputError, match=naming(tmp_path / "later.compact", "version 3", "export its run again")):
+        read(tmp_path / "later.compact")
     assert compact.looks_like(path, path.read_bytes()[:4096]) and compact.looks_like(tmp_path / "x.compact", b"")
 
 
