@@ -27,6 +27,7 @@ from scene_experts.files.export import export_several
 from scene_experts.files.options import Options
 from scene_experts.making.budget import LOOK, PAGE_GUESS, TRAINING, TimeBudget, Whole, guess_scores
 from scene_experts.making.plan import TrainingPlan, prepare, too_few
+from scene_experts.sfm.copies import leave_copies_out
 from scene_experts.sfm.lacking import explain_lacking
 from scene_experts.sfm.options import SfmOptions, SourceOptions
 from scene_experts.sfm.panoramas import cuts
@@ -125,7 +126,7 @@ def check_enough(source: Path, folder: Path, options: SourceOptions) -> None:
     which may take long. Panoramas have lists of views of their own."""
     if not source.is_dir() or is_capture(source) or is_capture(folder / CAPTURE) or len(list_files(source, folder)) >= 2 * FEW:
         return  # what is not known here is known when the poses are
-    found = find_photos(source, exclude=folder)
+    found, _ = leave_copies_out(source, find_photos(source, exclude=folder))
     if len(found) < FEW and not cuts(found, SfmOptions(**asdict(options))):
         raise too_few(len(found))
 

@@ -96,7 +96,7 @@ def reconstruct(
         masks = write_masks(found, images, folder / "masks")
         enough = ENOUGH_FOR_POSES if len(found) <= few and options.features != "learned" else None
         if prepare_folder(folder, found, options, masks, enough):
-            say("goes on from an earlier call of the same photographs, whose features and matches are kept")
+            say("goes on from an earlier call with the same photographs: the features and matches that it found are kept")
         request = describe_request(folder, images, groups, rig, bool(masks), pairs, names, options)
         request |= {"enough": enough, "film": source.is_file() and rig is None}
         began = time.monotonic()
@@ -265,7 +265,7 @@ def extract_photos(video: Path, images: Path, options: SfmOptions, say: Say, pro
 
 def prepare_folder(folder: Path, found: list[Photo], options: SfmOptions, masks: list[str], enough: int | None) -> bool:
     """Empty the work folder for this request. The database is kept if it holds features of the same
-    photographs and masks; returns whether it was.
+    photographs and masks. Returns whether there is one.
 
     masks: Checksums of the masks. enough: Features of a photograph without the smallest ones.
     """
@@ -285,7 +285,7 @@ def prepare_folder(folder: Path, found: list[Photo], options: SfmOptions, masks:
         note.write_text(mark)
     for left in (folder / "maps", folder / work.DONE / "model"):
         work.remove(left)
-    return kept
+    return kept and (database / "colmap.db").is_file()
 
 
 def describe_result(

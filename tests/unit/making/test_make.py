@@ -3,7 +3,7 @@
 import json
 import signal
 from dataclasses import asdict, replace
-from shutil import copytree
+from shutil import copyfile, copytree
 from types import SimpleNamespace
 
 import pytest
@@ -116,6 +116,9 @@ def test_scores_of_a_folder_with_too_few_photographs_are_refused_before_the_pose
     with pytest.raises(InputError, match=r"at least 12 photographs for --scores, found 11"):
         make(tmp_path / "photos", tmp_path / "out", scores=True, say=lambda _: None)
     assert not (tmp_path / "out").exists()
+    copyfile(tmp_path / "photos" / "0.jpg", tmp_path / "photos" / "copy.jpg")
+    with pytest.raises(InputError, match=r"found 11"):
+        make(tmp_path / "photos", tmp_path / "out", scores=True, say=lambda _: None)
     write_black(tmp_path / "photos", 12)
     making.check_enough(tmp_path / "photos", tmp_path / "out", SourceOptions())
 

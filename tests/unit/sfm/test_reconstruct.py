@@ -175,15 +175,19 @@ def test_photographs_and_frames_are_not_taken_for_each_other(tmp_path, monkeypat
 def test_only_the_same_request_reuses_its_database(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "run_worker", fake_worker())
     source, kept = write_black(tmp_path / "photos"), tmp_path / "out" / NAME / "database" / "colmap.db"
+    said = []
 
     def ask(options=SfmOptions()):  # noqa: B008
+        said.clear()
         with pytest.raises(InputError, match=naming(source)):
-            make(source, tmp_path / "out", options)
+            run.reconstruct(source, tmp_path / "out", options, say=said.append)
 
-    ask()
+    for _ in range(2):
+        ask()
+        assert not any("earlier call" in line for line in said)
     kept.write_bytes(b"features")
     ask(SfmOptions(matching="sequential"))
-    assert kept.exists()
+    assert kept.exists() and any("earlier call" in line for line in said)
     ask(SfmOptions(max_side=800))
     assert not kept.exists()
     kept.write_bytes(b"features")

@@ -63,6 +63,7 @@ def read(source: Path, data: Data | None, iteration: int | None, transform: Path
         placed = world.seen_from(noted or (0.0, 0.0, 0.0))
         capture = place_cameras(source, placed.from_input(splats.means.double()), world, noted or (0.0, 0.0, 0.0), data.background)
     else:
+        data = result_folder.drawn_as(data, about)
         capture = captures.load(data)
         capture.images.close()
         made_on = beside(source).get("capture")
