@@ -28,11 +28,11 @@ struct Term {
 };
 
 // The terms of a channel, filled up to a multiple of kTogether by terms of weight 0.
-std::vector<Term> find_terms(const int16_t* inputs, int64_t stride, const int8_t* weights, int64_t D) {
+std::vector<Term> find_terms(const int16_t* const* inputs, const int8_t* weights, int64_t D) {
   std::vector<Term> terms;
   for (int64_t d = 0; d < D; ++d)
-    if (weights[d] || weights[D + d]) terms.push_back({inputs + d * stride, weights[d], weights[D + d]});
-  while (terms.size() % kTogether) terms.push_back({inputs, 0, 0});
+    if (weights[d] || weights[D + d]) terms.push_back({inputs[d], weights[d], weights[D + d]});
+  while (terms.size() % kTogether) terms.push_back({inputs[0], 0, 0});
   return terms;
 }
 
@@ -85,11 +85,23 @@ void add_wide(const std::vector<Term>& terms, int64_t begin, int64_t count, int3
     }
 }
 #endif
+
+// `kColumns` columns at once, so that parents and weights are read once for all of them.
+template <int64_t kColumns>
+void blend_columns(const int16_t* columns, int64_t N, const int32_t* parents, const int32_t* weights, int64_t count, int16_t* out) {
+  for (int64_t i = 0; i < count; ++i) {
+    const int32_t *p = parents + 4 * i, *w = weights + 4 * i;
+    for (int64_t c = 0; c < kColumns; ++c) {
+      const int16_t* x = columns + c * N;
+      out[c * count + i] = static_cast<int16_t>((w[0] * x[p[0]] + w[1] * x[p[1]] + w[2] * x[p[2]] + w[3] * x[p[3]]) >> 8);
+    }
+  }
+}
 }  // namespace
 
-SE_EXPORT void se_code_predict(const int16_t* inputs, int64_t stride, const int8_t* weights, const int32_t* numbers, int64_t D,
-                               const int8_t* classes, int64_t count, int32_t* mean, int32_t* scale) {
-  const std::vector<Term> terms = find_terms(inputs, stride, weights, D);
+SE_EXPORT void se_code_predict(const int16_t* const* inputs, const int8_t* weights, const int32_t* numbers, int64_t D, const int8_t* classes,
+                               int64_t count, int32_t* mean, int32_t* scale) {
+  const std::vector<Term> terms = find_terms(inputs, weights, D);
   for (int64_t begin = 0; begin < count; begin += kRows) {
     const int64_t n = std::min(kRows, count - begin);
     int32_t sums[2][kRows];
@@ -121,12 +133,9 @@ SE_EXPORT void se_code_inputs(const int32_t* values, const int8_t* classes, int6
 
 SE_EXPORT void se_code_blend(const int16_t* columns, int64_t N, int64_t C, const int32_t* parents, const int32_t* weights, int64_t count,
                              int16_t* out) {
-  for (int64_t c = 0; c < C; ++c)
-    for (int64_t i = 0; i < count; ++i) {
-      int32_t sum = 0;
-      for (int j = 0; j < 4; ++j) sum += weights[4 * i + j] * columns[c * N + parents[4 * i + j]];
-      out[c * count + i] = static_cast<int16_t>(sum >> 8);
-    }
+  int64_t c = 0;
+  for (; c + kTogether <= C; c += kTogether) blend_columns<kTogether>(columns + c * N, N, parents, weights, count, out + c * count);
+  for (; c < C; ++c) blend_columns<1>(columns + c * N, N, parents, weights, count, out + c * count);
 }
 
 SE_EXPORT void se_code_parents(const int32_t* cells, const int32_t* rows, int64_t count, const int32_t* coarse, int64_t coarse_count,

@@ -243,10 +243,10 @@ SE_EXPORT int32_t se_code_read_bits(SeCodeReader* reader, const int32_t* odds, i
 // written; -1: out of memory.
 SE_EXPORT int64_t se_code_cells(const int64_t* keys, int64_t count, int32_t depth, uint32_t* operations, int64_t capacity);
 SE_EXPORT int32_t se_code_read_cells(SeCodeReader* reader, int32_t depth, int64_t count, int64_t* keys);
-// mean and scale [count] of a channel from inputs [D, stride] of which the first `count` columns are used: weights [2, D] of both, numbers
-// [4] = bias and shift of both, classes [count] of the anchors (a step is 2^class times the channel's).
-SE_EXPORT void se_code_predict(const int16_t* inputs, int64_t stride, const int8_t* weights, const int32_t* numbers, int64_t D,
-                               const int8_t* classes, int64_t count, int32_t* mean, int32_t* scale);
+// mean and scale [count] of a channel from inputs [D] of [count] each: weights [2, D] of both, numbers [4] = bias and shift of both, classes
+// [count] of the anchors (a step is 2^class times the channel's).
+SE_EXPORT void se_code_predict(const int16_t* const* inputs, const int8_t* weights, const int32_t* numbers, int64_t D, const int8_t* classes,
+                               int64_t count, int32_t* mean, int32_t* scale);
 // out [count]: values as inputs, (4 * 2^class value factor - offset) / 2^12, within +-2047; factor at least 1.
 SE_EXPORT void se_code_inputs(const int32_t* values, const int8_t* classes, int64_t count, int32_t factor, int32_t offset, int16_t* out);
 // out [C, count]: weighted means of columns [C, N] at parents [count, 4] with weights [count, 4] in 1/256.

@@ -12,7 +12,7 @@ import ctypes
 from ctypes import POINTER, Structure, c_double, c_float, c_int32, c_int64, c_void_p
 from typing import Any
 
-ABI_VERSION = 13
+ABI_VERSION = 14
 
 HEAD_TENSORS = ("router_w", "router_b", "w1", "b1", "middle_w", "middle_b", "w2", "b2")
 """The weights of a decoder head, in the order of `SeDecodeHead`."""
@@ -143,7 +143,7 @@ FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "se_code_read_bits": (_I, (POINTER(SeCodeReader), _P, _L, _P)),
     "se_code_cells": (_L, (_P, _L, _I, _P, _L)),
     "se_code_read_cells": (_I, (POINTER(SeCodeReader), _I, _L, _P)),
-    "se_code_predict": (None, (_P, _L, _P, _P, _L, _P, _L, _P, _P)),
+    "se_code_predict": (None, (_P, _P, _P, _L, _P, _L, _P, _P)),
     "se_code_inputs": (None, (_P, _P, _L, _I, _I, _P)),
     "se_code_blend": (None, (_P, _L, _L, _P, _P, _L, _P)),
     "se_code_parents": (None, (_P, _P, _L, _P, _L, _P, _P)),

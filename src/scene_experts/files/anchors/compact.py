@@ -103,7 +103,7 @@ def arrange(data: AnchorData) -> Arranged:
     if F > MOST_CHANNELS or K > MOST_SLOTS:
         raise InputError(f"expected at most {MOST_CHANNELS} channels and {MOST_SLOTS} Gaussians for a compact file, found {F} and {K}")
     boxes = choose_boxes(places.keys)
-    way = CodingOrder.of(places.keys, boxes)
+    way = CodingOrder.of(places.keys, boxes, places.fine)
     rows = along[way.rows]
     whole = round_scene(data, rows)
     return Arranged(places.ordered(way.rows), rows, way, boxes, whole, anchor_groups(F, K, SLOTS in whole.values, len(whole.extra)))
@@ -236,7 +236,7 @@ def decode_whole(data: bytes, source: Source) -> CompactScene:
     source.check_time()
     groups = anchor_groups(F, K, bool(header["slots"]), len(extra))
     first, second = (whole_number(v, "the bits of a box", 0, 63) for v in header["boxes"])
-    way = CodingOrder.of(places.keys, (first, second))
+    way = CodingOrder.of(places.keys, (first, second), places.fine)
     places = places.ordered(way.rows)
     stream = SymbolReader(parts[MODELS])
     models = code_models(reading(stream), groups, None)

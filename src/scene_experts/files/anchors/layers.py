@@ -200,8 +200,9 @@ def _merge(base: AnchorPlaces, added: AnchorPlaces) -> tuple[AnchorPlaces, NDArr
     if np.abs(fine).max(initial=0) > 1 << 60:
         raise Damaged("cells that are too far away")
     try:
-        keys = morton(from_zero(fine))
+        fine = from_zero(fine)
+        keys = morton(fine)
     except InputError as error:
         raise Damaged(str(error)) from None
     place = np.lexsort((lattice, keys))
-    return AnchorPlaces(every, cells[place], lattice[place], keys[place]), place
+    return AnchorPlaces(every, cells[place], lattice[place], keys[place], fine[place].astype(np.int32)), place

@@ -71,11 +71,8 @@ class AnchorPlaces:
     """[N], index of their lattice"""
     keys: Keys
     """[N], Morton keys on the finest lattice"""
-
-    @property
-    def fine(self) -> Ints:
-        """Cells [N, 3] of the finest lattice, from 0 to 2^21."""
-        return unmorton(self.keys).astype(np.int32)
+    fine: Ints
+    """[N, 3], cells of the finest lattice, from 0 to 2^21"""
 
     def columns(self, origin: tuple[float, float, float]) -> dict[str, Tensor]:
         """xyz [N, 3], and with several lattices or a level of detail the column level [N]."""
@@ -85,7 +82,7 @@ class AnchorPlaces:
 
     def ordered(self, rows: NDArray[Any]) -> AnchorPlaces:
         """The places of rows [N]."""
-        return AnchorPlaces(self.lattices, self.cells[rows], self.lattice[rows], self.keys[rows])
+        return AnchorPlaces(self.lattices, self.cells[rows], self.lattice[rows], self.keys[rows], self.fine[rows])
 
     def levels(self) -> Tensor:
         """The level of detail [N] int64 of each anchor."""
@@ -114,7 +111,7 @@ def find_places(data: AnchorData) -> tuple[AnchorPlaces, NDArray[np.int64]]:
         x, y, z = corner.tolist()
         distinct = len(_count_runs(np.sort(keys[lattice == i]))[0])
         lattices.append(Lattice(j, float(edges[j]), multiples[i], (x, y, z), len(own), distinct, depth))
-    return AnchorPlaces(lattices, cells[order], lattice[order], keys[order]), order
+    return AnchorPlaces(lattices, cells[order], lattice[order], keys[order], fine[order].astype(np.int32)), order
 
 
 def _multiple(edge: float, finest: float) -> int:
@@ -168,8 +165,9 @@ def read_places(lattices: list[Lattice], reader: SymbolReader) -> AnchorPlaces:
     reader.finish()
     cells, lattice_of = np.concatenate(own), np.concatenate(index)
     try:
-        keys = morton(from_zero(np.concatenate(fine)))
+        found = from_zero(np.concatenate(fine))
+        keys = morton(found)
     except InputError as error:
         raise Damaged(str(error)) from None
     order = np.lexsort((lattice_of, keys)) if len(lattices) > 1 else np.arange(len(keys))
-    return AnchorPlaces(lattices, cells[order], lattice_of[order], keys[order])
+    return AnchorPlaces(lattices, cells[order], lattice_of[order], keys[order], found[order].astype(np.int32))

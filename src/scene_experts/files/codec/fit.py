@@ -45,10 +45,10 @@ def fit_models(groups: Sequence[ChannelGroup], order: CodingOrder, values: Mappi
             continue
         parts = []
         for level, places in enumerate(order.levels):
-            inputs, used = walk.inputs(group, level, places)
+            inputs = walk.inputs(group, level, places)
             if group.is_chain:
-                inputs[used:] = walk.columns[group.name][:, places]
-            parts.append(inputs[:, ::every])
+                inputs.append(walk.columns[group.name][:, places])
+            parts.append(np.concatenate([block[:, ::every] for block in inputs.blocks]))
         rows = np.concatenate([np.arange(places.start, places.stop, every) for places in order.levels])
         live = walk.values[SLOTS][:, rows] != 0 if group.masked else None
         with one_thread():

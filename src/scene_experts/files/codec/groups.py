@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.files.codec.order import LEVELS, CodingOrder
 from scene_experts.files.codec.reference import Ints
-from scene_experts.files.codec.streams import MOST_INPUTS, SymbolReader, SymbolWriter, as_inputs, blend, predict
+from scene_experts.files.codec.streams import MOST_INPUTS, Inputs, SymbolReader, SymbolWriter, as_inputs, blend, predict
 from scene_experts.scene.anchors.quantise import HIGH_CLASS, LOW_CLASS
 
 CLASSES = HIGH_CLASS - LOW_CLASS + 1
@@ -118,12 +118,11 @@ class Walk:
         self.values = {name: np.ascontiguousarray(value, np.int32) for name, value in values.items()}
         out = {group.name: SymbolWriter(self.slow) for group in self.groups}
 
-        def code(group: ChannelGroup, found: Ints, mean: Ints, scale: Ints) -> Ints:
+        def code(group: ChannelGroup, found: Ints, mean: Ints, scale: Ints) -> None:
             if group.is_binary:
                 out[group.name].bits(found.astype(np.uint8), scale)
             else:
                 out[group.name].symbols(found, mean, scale)
-            return found
 
         self._run(code)
         return out
@@ -132,61 +131,59 @@ class Walk:
         """The values by group of streams by group. Raises Damaged for streams that do not fit."""
         readers = {group.name: SymbolReader(streams[group.name], self.slow) for group in self.groups}
 
-        def code(group: ChannelGroup, found: Ints, mean: Ints, scale: Ints) -> Ints:
+        def code(group: ChannelGroup, found: Ints, mean: Ints, scale: Ints) -> None:
             reader = readers[group.name]
-            found = reader.bits(scale).astype(np.int32) if group.is_binary else reader.symbols(mean, scale)
+            if group.is_binary:
+                found[:] = reader.bits(scale)
+            else:
+                reader.symbols(mean, scale, found)
             if group.name == CLASS and len(found) and not LOW_CLASS <= found.min() <= found.max() <= HIGH_CLASS:
                 raise Damaged("a step class out of range")
-            return found
 
         self._run(code)
         for reader in readers.values():
             reader.finish()
         return self.values
 
-    def _run(self, code: Callable[[ChannelGroup, Ints, Ints, Ints], Ints]) -> None:
-        """code(group, values, mean, scale) writes values, or reads and returns them."""
+    def _run(self, code: Callable[[ChannelGroup, Ints, Ints, Ints], None]) -> None:
+        """code(group, values, mean, scale) writes values, or reads them into their place."""
         for level, places in enumerate(self.order.levels):
             for group in self.groups if places.stop > places.start else ():
                 self._run_group(group, level, places, code)
 
-    def _run_group(self, group: ChannelGroup, level: int, places: slice, code: Callable[[ChannelGroup, Ints, Ints, Ints], Ints]) -> None:
+    def _run_group(self, group: ChannelGroup, level: int, places: slice, code: Callable[[ChannelGroup, Ints, Ints, Ints], None]) -> None:
         model, classes = self.models[group.name], self.classes(group, places)
-        inputs, used = self.inputs(group, level, places)
+        inputs, columns = self.inputs(group, level, places), self.columns[group.name][:, places]
         for c in range(group.channels):
-            mean, scale = predict(inputs, used, model.weights[c], model.numbers[c].tolist(), classes, self.slow)
+            mean, scale = predict(inputs, model.weights[c], model.numbers[c].tolist(), classes, self.slow)
             values = self.values[group.name][c, places]
             if group.masked:
                 live = self.values[SLOTS][c // group.masked, places] != 0
-                values[live] = code(group, values[live], mean[live], scale[live])
+                chosen = values[live]
+                code(group, chosen, mean[live], scale[live])
+                values[live] = chosen
             else:
-                values[:] = code(group, values, mean, scale)
+                code(group, values, mean, scale)
             if group.name in self._needed:
-                column = as_inputs(values, classes, *model.scaling[c].tolist(), slow=self.slow)
-                self.columns[group.name][c, places] = column
+                as_inputs(values, classes, *model.scaling[c].tolist(), out=columns[c], slow=self.slow)
                 if group.is_chain:
-                    inputs[used] = column
-                    used += 1
+                    inputs.append(columns[c : c + 1])
 
     def classes(self, group: ChannelGroup, places: slice) -> NDArray[np.int8]:
         """The step classes [n] that scale a group's steps at places of the coding order."""
         found = self.values[CLASS][0, places]
         return found.astype(np.int8) if group.has_steps else np.zeros(len(found), np.int8)
 
-    def inputs(self, group: ChannelGroup, level: int, places: slice) -> tuple[NDArray[np.int16], int]:
-        """The inputs [D, n] of a group's last channel at the places of a level, and how many of them
-        the first channel has; the rest is empty yet."""
-        n = places.stop - places.start
-        columns = [self.columns[name][:, places] for name in group.own]
-        columns += [blend(self.columns[group.name], *self.order.parents[level], slow=self.slow)] if group.from_parents else []
-        known = LEVELS + (CLASSES if group.has_steps else 0)
-        used = known + sum(map(len, columns))
-        out = np.empty((used + (group.channels if group.is_chain else 0), n), np.int16)
-        out[:LEVELS] = (np.arange(LEVELS)[:, None] == level) * UNIT
+    def inputs(self, group: ChannelGroup, level: int, places: slice) -> Inputs:
+        """The inputs [D, n] of a group's first channel at the places of a level."""
+        known = np.zeros((LEVELS, places.stop - places.start), np.int16)
+        known[level] = UNIT
+        out = Inputs(known)
         if group.has_steps:
-            out[LEVELS:known] = (np.arange(LOW_CLASS, HIGH_CLASS + 1, dtype=np.int8)[:, None] == self.classes(group, places)) * np.int16(
-                UNIT
-            )
-        if columns:
-            np.concatenate(columns, out=out[known:used])
-        return out, used
+            classes = np.arange(LOW_CLASS, HIGH_CLASS + 1, dtype=np.int8)[:, None]
+            out.append((classes == self.classes(group, places)) * np.int16(UNIT))
+        for name in group.own:
+            out.append(self.columns[name][:, places])
+        if group.from_parents:
+            out.append(blend(self.columns[group.name], *self.order.parents[level], slow=self.slow))
+        return out

@@ -56,8 +56,9 @@ class CodingOrder:
         return [slice(begin, end) for begin, end in zip([0, *self.ends], self.ends)]
 
     @classmethod
-    def of(cls, keys: Keys, boxes: tuple[int, int], slow: bool = False) -> CodingOrder:
-        """keys: [N] Morton keys, ascending. Raises Damaged for boxes that are none."""
+    def of(cls, keys: Keys, boxes: tuple[int, int], cells: Ints | None = None, slow: bool = False) -> CodingOrder:
+        """keys: [N] Morton keys, ascending; cells: [N, 3], theirs, where they are known. Raises Damaged
+        for boxes that are none."""
         if not all(0 <= bits <= MOST_BITS for bits in boxes):
             raise Damaged(f"boxes of {boxes} bits")
         level = np.full(len(keys), LEVELS - 1, np.int8)
@@ -67,7 +68,7 @@ class CodingOrder:
         order = np.concatenate(rows)
         place = np.empty(len(keys), np.int32)
         place[order] = np.arange(len(keys), dtype=np.int32)
-        cells, parents = unmorton(keys).astype(np.int32), []
+        parents, cells = [], unmorton(keys).astype(np.int32) if cells is None else cells
         for number, own in enumerate(rows):
             found, weights = find_parents(cells, own, np.flatnonzero(level < number).astype(np.int32), slow)
             parents.append((place[found] if len(keys) else found, weights))

@@ -20,7 +20,7 @@ from scene_experts.files.codec.fit import ROWS, blank_model, fit_model
 from scene_experts.files.codec.groups import CLASS, CLASSES, FEATURE, OFFSETS, SCALING, SLOTS, UNIT, ChannelGroup, GroupModel, anchor_groups
 from scene_experts.files.codec.order import LEVELS
 from scene_experts.files.codec.reference import Ints
-from scene_experts.files.codec.streams import SymbolReader, SymbolWriter, as_inputs, blend, find_parents, predict
+from scene_experts.files.codec.streams import Inputs, SymbolReader, SymbolWriter, as_inputs, blend, find_parents, predict
 from scene_experts.files.formats.morton import Keys, unmorton
 from scene_experts.scene.anchors.quantise import HIGH_CLASS, LOW_CLASS
 
@@ -151,8 +151,9 @@ class Refiner:
 
         def visit(group: ChannelGroup, rows: Ints, inputs: NDArray[np.int16], used: int, live: NDArray[np.bool_] | None) -> None:
             name, model, classes = group.name.removesuffix(MORE), self.models[group.name], self.classes(group, rows)
+            found = Inputs(inputs)
             for c in range(group.channels):
-                mean, scale = predict(inputs, used, model.weights[c], model.numbers[c].tolist(), classes, self.slow)
+                mean, scale = predict(found, model.weights[c], model.numbers[c].tolist(), classes, self.slow)
                 if live is None:
                     self.values[name][c, rows] = code(group, c, rows, mean, scale)
                 else:

@@ -116,12 +116,14 @@ class SymbolReader:
         if status:
             raise Damaged("a stream that does not fit its contents")
 
-    def symbols(self, mean: Ints, scale: Ints) -> Ints:
-        """The values [n] that were coded with the same mean [n] and scale [n]."""
+    def symbols(self, mean: Ints, scale: Ints, out: Ints | None = None) -> Ints:
+        """The values [n] that were coded with the same mean [n] and scale [n], in `out` if it is given."""
+        out = np.empty(len(mean), np.int32) if out is None else out
         if self._slow is not None:
-            return self._slow.symbols(mean, scale)
+            out[:] = self._slow.symbols(mean, scale)
+            return out
         mean, scale = np.ascontiguousarray(mean, np.int32), np.ascontiguousarray(scale, np.int32)
-        out = np.empty(len(mean), np.int32)
+        assert len(mean) == len(scale) == len(out)
         self._check(self._library.se_code_read(ctypes.byref(self._state), _at(mean), _at(scale), len(mean), _at(out)))  # type: ignore[union-attr]
         return out
 
@@ -153,28 +155,50 @@ class SymbolReader:
             raise Damaged("a stream that is longer than its contents")
 
 
+class Inputs:
+    """Inputs [D, n] of contexts: blocks of rows, which stay where they are."""
+
+    def __init__(self, *blocks: NDArray[np.int16]) -> None:
+        self.blocks: list[NDArray[np.int16]] = []
+        self.places = np.empty(0, np.int64)
+        """[D] addresses"""
+        for block in blocks:
+            self.append(block)
+
+    def append(self, block: NDArray[np.int16]) -> None:
+        """Add the rows [any, n] of a block, each in one piece."""
+        assert block.dtype == np.int16 and (block.shape[1] < 2 or block.strides[1] == 2)
+        self.blocks.append(block)
+        rows = block.__array_interface__["data"][0] + block.strides[0] * np.arange(len(block))
+        self.places = np.concatenate([self.places, rows])
+
+
 def predict(
-    inputs: NDArray[np.int16], used: int, weights: NDArray[np.int8], numbers: Sequence[int], classes: NDArray[np.int8], slow: bool = False
+    inputs: Inputs, weights: NDArray[np.int8], numbers: Sequence[int], classes: NDArray[np.int8], slow: bool = False
 ) -> tuple[Ints, Ints]:
-    """`reference.predict` with the first `used` rows of inputs [at least D, n]; weights [2, D]."""
-    library = None if slow else native.load()
+    """`reference.predict` with the first D inputs; weights [2, D]."""
+    library, used = None if slow else native.load(), weights.shape[1]
     if library is None:
-        return reference.predict(inputs[:used], weights, numbers, classes)
-    n = inputs.shape[1]
+        return reference.predict(np.concatenate(inputs.blocks)[:used], weights, numbers, classes)
+    n = len(classes)
     mean, scale, four = np.empty(n, np.int32), np.empty(n, np.int32), np.array(numbers, np.int32)
     weights, classes = np.ascontiguousarray(weights, np.int8), np.ascontiguousarray(classes, np.int8)
-    assert weights.shape == (2, used) and len(classes) == n
-    library.se_code_predict(_at(inputs), n, _at(weights), _at(four), used, _at(classes), n, _at(mean), _at(scale))
+    assert used <= len(inputs.places) and all(block.shape[1] == n for block in inputs.blocks)
+    library.se_code_predict(_at(inputs.places), _at(weights), _at(four), used, _at(classes), n, _at(mean), _at(scale))
     return mean, scale
 
 
-def as_inputs(values: Ints, classes: NDArray[np.int8], factor: int, offset: int, slow: bool = False) -> NDArray[np.int16]:
-    """`reference.as_inputs`."""
+def as_inputs(
+    values: Ints, classes: NDArray[np.int8], factor: int, offset: int, out: NDArray[np.int16] | None = None, slow: bool = False
+) -> NDArray[np.int16]:
+    """`reference.as_inputs`, in `out` [n] if it is given."""
     library = None if slow else native.load()
+    out = np.empty(len(values), np.int16) if out is None else out
     if library is None:
-        return reference.as_inputs(values, classes, factor, offset)
+        out[:] = reference.as_inputs(values, classes, factor, offset)
+        return out
     values, classes = np.ascontiguousarray(values, np.int32), np.ascontiguousarray(classes, np.int8)
-    out = np.empty(len(values), np.int16)
+    assert len(values) == len(classes) == len(out)
     library.se_code_inputs(_at(values), _at(classes), len(values), factor, offset, _at(out))
     return out
 
@@ -183,7 +207,7 @@ def blend(columns: NDArray[np.int16], parents: Ints, weights: Ints, slow: bool =
     """`reference.blend`."""
     library = None if slow else native.load()
     if library is None:
-        return reference.blend(columns, parents, weights)
+        return np.ascontiguousarray(reference.blend(columns, parents, weights))
     out = np.empty((len(columns), len(parents)), np.int16)
     library.se_code_blend(_at(columns), columns.shape[1], len(columns), _at(parents), _at(weights), len(parents), _at(out))
     return out

@@ -28,7 +28,7 @@ def test_levels_have_at_most_their_shares_and_parents_are_coarser():
 
 def test_the_slow_form_is_the_same():
     found = keys(90)
-    fast, slow = (CodingOrder.of(found, (9, 6), slow) for slow in (False, True))
+    fast, slow = (CodingOrder.of(found, (9, 6), slow=slow) for slow in (False, True))
     assert all(np.array_equal(a, b) for x, y in zip(fast.parents, slow.parents) for a, b in zip(x, y))
 
 

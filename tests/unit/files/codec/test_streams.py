@@ -113,12 +113,17 @@ def test_contexts_are_those_of_the_reference():
     inputs = rng.integers(-2047, 2048, (D + 3, n)).astype(np.int16)
     weights, classes = rng.integers(-127, 128, (2, D)).astype(np.int8), rng.integers(-2, 5, n).astype(np.int8)
     for numbers in ((1 << 27, 12, -5000, 9), (-77, -4, 3, 0), (0, 0, 1 << 28, -5)):
-        for a, b in zip(streams.predict(inputs, D, weights, numbers, classes), reference.predict(inputs[:D], weights, numbers, classes)):
+        for a, b in zip(
+            streams.predict(streams.Inputs(inputs), weights, numbers, classes), reference.predict(inputs[:D], weights, numbers, classes)
+        ):
             assert np.array_equal(a, b)
     weights[:, 3:40], weights[0, 40:50], weights[1, 45:60] = 0, 0, 0
     for used, rows in ((D, 0), (D, 15), (D, 16), (D, 1041), (0, 40), (1, 40), (5, 40), (50, 40)):
         some, few, its = np.ascontiguousarray(inputs[:, :rows]), weights[:, :used], classes[:rows]
-        found = streams.predict(some, used, few, (-77, 4, 3, 2), its), reference.predict(some[:used], few, (-77, 4, 3, 2), its)
+        found = (
+            streams.predict(streams.Inputs(some[:3], some[3:]), few, (-77, 4, 3, 2), its),
+            reference.predict(some[:used], few, (-77, 4, 3, 2), its),
+        )
         assert all(np.array_equal(a, b) for a, b in zip(*found)), (used, rows)
     values = rng.integers(-(1 << 31), 1 << 31, n).astype(np.int32)
     values[: n // 2] >>= 20
