@@ -28,7 +28,7 @@ struct Term {
 };
 
 // The terms of a channel, filled up to a multiple of kTogether by terms of weight 0.
-std::vector<Term> find_terms(const int16_t* const* inputs, const int8_t* weights, int64_t D) {
+std::vector<Term> find_terms(const int16_t** inputs, const int8_t* weights, int64_t D) {
   std::vector<Term> terms;
   for (int64_t d = 0; d < D; ++d)
     if (weights[d] || weights[D + d]) terms.push_back({inputs[d], weights[d], weights[D + d]});
@@ -99,7 +99,7 @@ void blend_columns(const int16_t* columns, int64_t N, const int32_t* parents, co
 }
 }  // namespace
 
-SE_EXPORT void se_code_predict(const int16_t* const* inputs, const int8_t* weights, const int32_t* numbers, int64_t D, const int8_t* classes,
+SE_EXPORT void se_code_predict(const int16_t** inputs, const int8_t* weights, const int32_t* numbers, int64_t D, const int8_t* classes,
                                int64_t count, int32_t* mean, int32_t* scale) {
   const std::vector<Term> terms = find_terms(inputs, weights, D);
   for (int64_t begin = 0; begin < count; begin += kRows) {

@@ -137,3 +137,19 @@ SE_EXPORT int32_t se_code_read_bits(SeCodeReader* reader, const int32_t* odds, i
   for (int64_t i = 0; i < count && !input.failed(); ++i) bits[i] = input.bit(tables.zeros[std::clamp(odds[i], 0, kCodeTopOdds)]);
   return keep(reader, input);
 }
+
+SE_EXPORT void se_code_restore(const int32_t* whole, int64_t N, int64_t C, const float* steps, const float* scale, float* out) {
+  constexpr int64_t kRows = 16, kColumns = 64;  // of a block, which stays in the cache while it is turned
+  for (int64_t first = 0; first < C; first += kColumns)
+    for (int64_t begin = 0; begin < N; begin += kRows) {
+      const int64_t n = std::min(kRows, N - begin), m = std::min(kColumns, C - first);
+      float block[kColumns][kRows];
+      for (int64_t c = 0; c < m; ++c) {
+        const int32_t* row = whole + (first + c) * N + begin;
+        const float step = steps[first + c];
+        for (int64_t i = 0; i < n; ++i) block[c][i] = static_cast<float>(row[i]) * step * (scale ? scale[begin + i] : 1.0f);
+      }
+      for (int64_t i = 0; i < n; ++i)
+        for (int64_t c = 0; c < m; ++c) out[(begin + i) * C + first + c] = block[c][i];
+    }
+}

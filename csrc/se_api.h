@@ -245,7 +245,7 @@ SE_EXPORT int64_t se_code_cells(const int64_t* keys, int64_t count, int32_t dept
 SE_EXPORT int32_t se_code_read_cells(SeCodeReader* reader, int32_t depth, int64_t count, int64_t* keys);
 // mean and scale [count] of a channel from inputs [D] of [count] each: weights [2, D] of both, numbers [4] = bias and shift of both, classes
 // [count] of the anchors (a step is 2^class times the channel's).
-SE_EXPORT void se_code_predict(const int16_t* const* inputs, const int8_t* weights, const int32_t* numbers, int64_t D, const int8_t* classes,
+SE_EXPORT void se_code_predict(const int16_t** inputs, const int8_t* weights, const int32_t* numbers, int64_t D, const int8_t* classes,
                                int64_t count, int32_t* mean, int32_t* scale);
 // out [count]: values as inputs, (4 * 2^class value factor - offset) / 2^12, within +-2047; factor at least 1.
 SE_EXPORT void se_code_inputs(const int32_t* values, const int8_t* classes, int64_t count, int32_t factor, int32_t offset, int16_t* out);
@@ -256,5 +256,7 @@ SE_EXPORT void se_code_blend(const int16_t* columns, int64_t N, int64_t C, const
 // of cells [N, 3].
 SE_EXPORT void se_code_parents(const int32_t* cells, const int32_t* rows, int64_t count, const int32_t* coarse, int64_t coarse_count,
                                int32_t* parents, int32_t* weights);
+// out [N, C]: whole numbers [C, N] times steps [C] times scale [N] (NULL: 1).
+SE_EXPORT void se_code_restore(const int32_t* whole, int64_t N, int64_t C, const float* steps, const float* scale, float* out);
 
 #endif

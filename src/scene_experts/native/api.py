@@ -143,10 +143,11 @@ FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "se_code_read_bits": (_I, (POINTER(SeCodeReader), _P, _L, _P)),
     "se_code_cells": (_L, (_P, _L, _I, _P, _L)),
     "se_code_read_cells": (_I, (POINTER(SeCodeReader), _I, _L, _P)),
-    "se_code_predict": (None, (_P, _P, _P, _L, _P, _L, _P, _P)),
+    "se_code_predict": (None, (POINTER(c_void_p), _P, _P, _L, _P, _L, _P, _P)),
     "se_code_inputs": (None, (_P, _P, _L, _I, _I, _P)),
     "se_code_blend": (None, (_P, _L, _L, _P, _P, _L, _P)),
     "se_code_parents": (None, (_P, _P, _L, _P, _L, _P, _P)),
+    "se_code_restore": (None, (_P, _L, _L, _P, _P, _P)),
 }
 """Result and argument types of every exported function, by name."""
 

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,6 +22,7 @@ from scene_experts.files.anchors.precision import ROUNDED, Precision, from_sprea
 from scene_experts.files.codec.groups import CLASS, EXTRA, FEATURE, OFFSETS, SCALING, SLOTS
 from scene_experts.files.codec.numbers import Rounded
 from scene_experts.files.codec.reference import Ints
+from scene_experts.files.codec.streams import restore as restore_values
 
 MOST_SYMBOL = 1 << 30
 FURTHER = {"interval": 0.02, "extra_level": 0.008}
@@ -143,8 +144,11 @@ def restore(whole: WholeScene, data: AnchorData, shapes: Mapping[str, tuple[int,
     """The scene of whole numbers. data: everything else of it; its columns have at least xyz.
     shapes: of the networks' tensors. Raises Damaged for numbers that are no scene."""
     v, n = whole.values, len(data.columns["xyz"])
-    scale = torch.from_numpy((np.float32(2.0) ** v[CLASS][0]).astype(np.float32))
-    floats = {name: _restore_rows(v[name], steps, None if name == EXTRA else scale) for name, steps in whole.steps.items()}
+    scale = (np.float32(2.0) ** v[CLASS][0]).astype(np.float32)
+    floats = {
+        name: torch.from_numpy(restore_values(v[name], np.array(steps, np.float32), None if name == EXTRA else scale))
+        for name, steps in whole.steps.items()
+    }
     columns = {"feature": floats[FEATURE], "log_scaling": floats[SCALING], "offsets": floats[OFFSETS].reshape(n, len(v[OFFSETS]) // 3, 3)}
     for i, name in enumerate(whole.extra):
         value = floats[EXTRA][:, i].clone()
@@ -163,18 +167,6 @@ def restore(whole: WholeScene, data: AnchorData, shapes: Mapping[str, tuple[int,
         if name not in networks or networks[name].dim() != 3 or not -networks[name].shape[2] <= column < networks[name].shape[2]:
             raise Damaged(f"networks without the column of the distance in {name}")
         networks[name][:, :, column] *= 2.0**exponent
-    return out
-
-
-def _restore_rows(whole: Ints, steps: Sequence[float], scale: Tensor | None) -> Tensor:
-    """The values [N, C] of whole numbers [C, N] in steps [C] times scale [N], some rows at a time, which
-    stay in the cache."""
-    given, own = torch.from_numpy(whole), torch.tensor(steps, dtype=torch.float32)[:, None]
-    out = torch.empty((given.shape[1], given.shape[0]))
-    for begin in range(0, len(out), ROWS):
-        few = slice(begin, begin + ROWS)
-        found = given[:, few].float().mul_(own)
-        out[few] = (found if scale is None else found.mul_(scale[few])).t()
     return out
 
 

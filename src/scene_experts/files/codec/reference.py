@@ -31,6 +31,7 @@ ROOTS = (
 """round(2^26 2^(-2^-b)), b = 1 .. 16."""
 REACH, LARGEST = 2047, 1 << 26  # largest input, largest mean
 Ints = NDArray[np.int32]
+Floats = NDArray[np.float32]
 
 
 # --- tables -------------------------------------------------------------------------------------------------------------------------------
@@ -314,3 +315,9 @@ def find_parents(cells: Ints, rows: Ints, coarse: Ints) -> tuple[Ints, Ints]:
     share = np.where(there, 65536 // (away + 1), 0)
     total = share.sum(1, keepdims=True)
     return parents.astype(np.int32), np.where(total > 0, share * 256 // np.maximum(total, 1), 0).astype(np.int32)
+
+
+def restore(whole: Ints, steps: Floats, scale: Floats | None) -> Floats:
+    """The values [N, C] of whole numbers [C, N] in steps [C] times scale [N] (None: 1)."""
+    found = whole.astype(np.float32) * steps[:, None]
+    return np.ascontiguousarray((found if scale is None else found * scale).T)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.files.codec import reference
-from scene_experts.files.codec.reference import Ints
+from scene_experts.files.codec.reference import Floats, Ints
 from scene_experts.native import api
 from scene_experts.native import library as native
 
@@ -184,7 +184,8 @@ def predict(
     mean, scale, four = np.empty(n, np.int32), np.empty(n, np.int32), np.array(numbers, np.int32)
     weights, classes = np.ascontiguousarray(weights, np.int8), np.ascontiguousarray(classes, np.int8)
     assert used <= len(inputs.places) and all(block.shape[1] == n for block in inputs.blocks)
-    library.se_code_predict(_at(inputs.places), _at(weights), _at(four), used, _at(classes), n, _at(mean), _at(scale))
+    places = (ctypes.c_void_p * len(inputs.places)).from_address(_at(inputs.places))
+    library.se_code_predict(places, _at(weights), _at(four), used, _at(classes), n, _at(mean), _at(scale))
     return mean, scale
 
 
@@ -222,3 +223,16 @@ def find_parents(cells: Ints, rows: Ints, coarse: Ints, slow: bool = False) -> t
     parents, weights = np.empty((len(rows), 4), np.int32), np.empty((len(rows), 4), np.int32)
     library.se_code_parents(_at(cells), _at(rows), len(rows), _at(coarse), len(coarse), _at(parents), _at(weights))
     return parents, weights
+
+
+def restore(whole: Ints, steps: Floats, scale: Floats | None, slow: bool = False) -> Floats:
+    """`reference.restore`."""
+    library = None if slow else native.load()
+    if library is None:
+        return reference.restore(whole, steps, scale)
+    (C, N), whole, steps = whole.shape, np.ascontiguousarray(whole, np.int32), np.ascontiguousarray(steps, np.float32)
+    scale = None if scale is None else np.ascontiguousarray(scale, np.float32)
+    assert len(steps) == C and (scale is None or len(scale) == N)
+    out = np.empty((N, C), np.float32)
+    library.se_code_restore(_at(whole), N, C, _at(steps), None if scale is None else _at(scale), _at(out))
+    return out

@@ -129,6 +129,10 @@ def test_contexts_are_those_of_the_reference():
     values[: n // 2] >>= 20
     for factor, offset in ((1, 0), (1 << 20, -(1 << 28)), (700, 123456)):
         assert np.array_equal(streams.as_inputs(values, classes, factor, offset), reference.as_inputs(values, classes, factor, offset))
+    for C, N in ((1, n), (7, 33), (70, 16), (96, 5), (3, 0)):
+        whole, steps = rng.integers(-(1 << 30), 1 << 30, (C, N)).astype(np.int32), rng.random(C).astype(np.float32)
+        for scale in (None, 2.0 ** rng.integers(-2, 5, N).astype(np.float32)):
+            assert np.array_equal(streams.restore(whole, steps, scale), reference.restore(whole, steps, scale))
     cells = rng.integers(0, 1 << 21, (400, 3)).astype(np.int32)
     rows, coarse = np.arange(1, 400, 2, dtype=np.int32), np.arange(0, 400, 8, dtype=np.int32)
     for some in (coarse, coarse[:1], coarse[:0]):
