@@ -15,7 +15,7 @@ from scene_experts.data.settings import Data
 def info(args: list[str]) -> int:
     about = (
         "Show what a capture contains: views, picture sizes, cameras, points, split and warnings; "
-        "or, for a run folder, its recipe, size, scores and files."
+        "for a run folder, its recipe, size, scores and files; or what the file of a scene holds."
     )
     brought = {"normalise": defaults_in(args).normalise}
     data = parse(Data, Command(f"{PROG} info", ("data",), about=about, defaults=brought), args)
@@ -28,12 +28,13 @@ def info(args: list[str]) -> int:
     from scene_experts.training import run_folder
 
     console = Console(markup=False, highlight=False)
-    if is_run(data.path):
-        from scene_experts.commands.run_facts import print_run
+    if (run := is_run(data.path)) or is_scene(data.path):
+        from scene_experts.commands.run_facts import print_file, print_run
 
         if given := [word for word in args if word.startswith("-") and word not in ("-s", "--data")]:
-            raise InputError(f"expected no {given[0]} with a run folder, found {data.path}; leave it out, or give a capture")
-        print_run(data.path, console)
+            what = "a run folder" if run else "a scene"
+            raise InputError(f"expected no {given[0]} with {what}, found {data.path}; leave it out, or give a capture")
+        (print_run if run else print_file)(data.path, console)
         return 0
     capture = captures.load(run_folder.named(data), allow_no_points=True)
     print_summary(capture, console)
@@ -47,6 +48,21 @@ def is_run(folder: Path) -> bool:
     from scene_experts.data.readers import is_capture
 
     return (folder / "config.json").is_file() and (folder / "checkpoints").is_dir() and not is_capture(folder)
+
+
+def is_scene(path: Path) -> bool:
+    """Whether a path is a file of a known format, a folder of SOG or a result folder, and no capture."""
+    from scene_experts.data.readers import is_capture
+    from scene_experts.files.registry import recognise, scene_file
+    from scene_experts.files.result_folder import is_result
+
+    if is_result(path) or not scene_file(path).is_file():
+        return is_result(path) and not is_capture(path)
+    try:
+        recognise(scene_file(path))
+    except InputError:
+        return False
+    return not is_capture(path)
 
 
 @dataclass(frozen=True)

@@ -1,18 +1,23 @@
-"""What a run folder holds, for `scene-experts info RUN`."""
+"""What a run folder or the file of a scene holds, for `scene-experts info`."""
 
 from __future__ import annotations
 
 import shlex
 from pathlib import Path
 
+import torch
 from rich.console import Console
 from rich.table import Table
+from torch import Tensor
 
 from scene_experts.commands import PROG
 from scene_experts.core.io import read_json
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.numbers import number
 from scene_experts.files.export import NAME
+from scene_experts.files.lone import open_scene
+from scene_experts.files.registry import recognise
+from scene_experts.files.scene_folder import world_of
 from scene_experts.training import run_folder
 from scene_experts.training.progress import format_duration
 
@@ -20,11 +25,23 @@ from scene_experts.training.progress import format_duration
 def print_run(run: Path, console: Console) -> None:
     """Print the facts of a run, and the command that comes next. Raises InputError if the run has no
     intact checkpoint."""
+    _print(find_facts(run), propose_next(run), console)
+
+
+def print_file(path: Path, console: Console) -> None:
+    """Print the facts of a scene without a run, and how to see it. Raises InputError for what cannot be
+    read."""
+    _print(find_file_facts(path), shlex.join([PROG, "view", str(path)]), console)
+
+
+def _print(facts: dict[str, str], proposal: str, console: Console) -> None:
     table = Table(box=None, show_header=False)
-    for name, value in find_facts(run).items():
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in facts.items():
         table.add_row(name, value)
     console.print(table)
-    console.print(f"next: {propose_next(run)}", markup=False, soft_wrap=True)
+    console.print(f"next: {proposal}", markup=False, soft_wrap=True)
 
 
 def find_facts(run: Path) -> dict[str, str]:
@@ -47,6 +64,33 @@ def find_facts(run: Path) -> dict[str, str]:
         "files": ", ".join(sorted(path.name for path in run.glob(f"{NAME}.*") if path.suffix != ".json")) or "none: `export` writes them",
     }
     return {name: value for name, value in facts.items() if value}
+
+
+def find_file_facts(path: Path) -> dict[str, str]:
+    """Return the facts of a file, a folder of SOG or a result folder by name: format, bytes, what it is
+    made of, its extent, and what it says about its training. Raises InputError for what cannot be
+    read."""
+    opened = open_scene(path)
+    assert opened.lone is not None
+    source, scene, note = opened.lone.source, opened.scene, opened.lone.note
+    sides = _extent(scene.positions.detach().cpu()) / world_of(opened).scale
+    trained = opened.step or note.get("step", 0)
+    facts = {
+        "file": str(source),
+        "format": f"{recognise(source)[0]}, {source.stat().st_size:,} bytes" if source.is_file() else "",
+        scene.traits.rows: f"{len(scene.table):,}",
+        "extent": " x ".join(f"{side:.3g}" for side in sides.tolist()) + f" in the file's unit (98 % of the {scene.traits.rows})",
+        "recipe": note.get("recipe", ""),
+        "iterations": f"{trained:,}" if trained else "",
+    }
+    return {name: value for name, value in facts.items() if value}
+
+
+def _extent(positions: Tensor) -> Tensor:
+    """The sides [3] of a box along the axes, without the lowest and highest 1 % of each."""
+    rows = positions.sort(dim=0).values
+    left_out = len(rows) // 100
+    return rows[len(rows) - 1 - left_out] - rows[left_out] if len(rows) else torch.zeros(3)
 
 
 def find_scores(run: Path) -> str:

@@ -1,10 +1,12 @@
 """`info RUN`: the facts of a run folder."""
 
+import shutil
+
 import pytest
 
 import scene_experts as se
 from scene_experts.commands import inspect
-from scene_experts.commands.run_facts import find_facts, find_scores, propose_next
+from scene_experts.commands.run_facts import find_facts, find_file_facts, find_scores, propose_next
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_json
 from support.synthetic import make_capture
@@ -28,6 +30,30 @@ def test_the_facts_of_a_run_tell_what_it_is_and_what_comes_next(run, capsys):
 def test_options_of_captures_are_refused_for_runs(run):
     with pytest.raises(InputError, match="--split"):
         inspect.info([str(run), "--split", "none"])
+
+
+@pytest.mark.parametrize("format, suffix", [("compact", ".compact"), ("ply", ".ply"), ("sog", ".sog")])
+def test_the_facts_of_a_file_tell_its_format_size_and_rows_without_a_capture(run, tmp_path, capsys, format, suffix):
+    (tmp_path / "its own").mkdir()
+    file = se.open_run(run).export(format, tmp_path / f"its own/balls{suffix}")
+    assert inspect.info([str(file)]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert f"format {format}, {file.stat().st_size:,} bytes" in shown and f"next: scene-experts view '{file}'" in shown
+    facts = find_file_facts(file)
+    assert int(facts["anchors" if format == "compact" else "Gaussians"].replace(",", "")) > 10
+    assert facts["iterations"] == "2" and facts["extent"].count(" x ") == 2
+    with pytest.raises(InputError, match="expected no --split with a scene"):
+        inspect.info([str(file), "--split", "none"])
+
+
+def test_a_result_folder_has_facts_and_a_file_of_something_else_is_no_scene(run, tmp_path):
+    assert find_file_facts(se.open_run(run).export("ply", tmp_path / "a.ply"))["recipe"] == "scaffold-gs"
+    shutil.copytree(run / "point_cloud", tmp_path / "result/point_cloud")
+    assert inspect.is_scene(tmp_path / "result") and "anchors" in find_file_facts(tmp_path / "result")
+    (tmp_path / "notes.txt").write_text("nothing")
+    assert not inspect.is_scene(tmp_path / "notes.txt")
+    with pytest.raises(InputError, match="found a file"):
+        inspect.info([str(tmp_path / "notes.txt")])
 
 
 def test_scores_are_told_with_their_iteration_and_damaged_ones_are_none(tmp_path):
