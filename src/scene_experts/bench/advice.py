@@ -17,6 +17,8 @@ from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.numbers import number
 from scene_experts.core.version import __version__
 from scene_experts.render import choose, gsplat_install
+from scene_experts.training.early import slow_down
+from scene_experts.training.progress import cost_on_cpu
 
 LIMIT = 8.0  # minutes, so that a capture of few photographs, its training, scores and page take a quarter of an hour together
 SIDES = ((0, 7000), (1200, 7000), (800, 7000), (800, 4000), (600, 4000), (600, 3000), (600, 2000), (400, 2000))
@@ -86,9 +88,11 @@ def recall_picture() -> float:
 
 
 def estimate_minutes(width: int, height: int, iterations: int, picture: float, threads: int) -> float:
-    """Minutes of a training. picture: see `measure_picture`."""
+    """Minutes of a training of the recipe that is proposed. picture: see `measure_picture`."""
     gain, pixels = 1 / (SERIAL + (1 - SERIAL) / threads), width * height / 1e6
-    return iterations * picture * (BASE + PER_MEGAPIXEL * pixels * min(1.0, pixels / MEASURED)) / gain / 60
+    slower = slow_down(width, height)  # the first half takes that much less
+    saved = cost_on_cpu(1.0, slower) / slower / cost_on_cpu(1.0)
+    return iterations * picture * (BASE + PER_MEGAPIXEL * pixels * min(1.0, pixels / MEASURED)) * saved / gain / 60
 
 
 def suggest(width: int, height: int, views: int, picture: float | None = None, limit: float | None = None) -> Advice:

@@ -87,6 +87,18 @@ class Camera:
         """Vertical field of view, radians, if the principal point is at the image centre."""
         return 2.0 * math.atan(self.height / (2.0 * self.fy))
 
+    def shrunk(self, by: int) -> Camera:
+        """Return the camera of a picture of 1 / by of the size, rounded down: each of its pixels shows
+        what by x by pixels of this one show. It is made once."""
+        if by == 1:
+            return self
+        known: dict[int, Camera] = self.__dict__.setdefault("shrunken", {})
+        if by not in known:
+            K = self.K.clone()
+            K[:2] /= by
+            known[by] = replace(self, K=K, width=self.width // by, height=self.height // by)
+        return known[by]
+
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
         """Return the camera with its tensors on `device` and with `dtype`. One on a GPU is made
         once."""

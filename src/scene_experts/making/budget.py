@@ -61,6 +61,7 @@ class Whole:
 
     def __init__(self, progress: Progress, now: Callable[[], float] = time.monotonic) -> None:
         self.progress, self.now, self.what, self.pace = progress, now, "", Speedometer(now)
+        self.slower = 1.0  # `Started.slower` of the training
         self.later = 0.0  # seconds of the stages after this one
         self.least: Callable[[], float] = lambda: 0.0  # seconds that the whole takes in any case
 
@@ -72,7 +73,7 @@ class Whole:
         if speed is None or total <= 0:
             self.progress(what, done, total)
             return
-        parts = count_left(done, total) if what == TRAINING else max(0, total - done)
+        parts = count_left(done, total, self.slower) if what == TRAINING else max(0, total - done)
         left = max(parts / speed + self.later, self.least())
         self.progress(f"{what} (about {format_duration(left)} left in all)", done, total)
 
@@ -100,11 +101,11 @@ def _within(iterations: float, views: int) -> int:
     return min(max(round(iterations), LEAST), MOST_OF_FEW if views <= FEW else MOST)
 
 
-def find_slowness(iterations: int, step: int, seconds: float, minutes: float | None, have: float) -> float | None:
+def find_slowness(iterations: int, step: int, seconds: float, minutes: float | None, have: float, slower: float = 1.0) -> float | None:
     """Return how many times longer than the estimated minutes a training of `iterations` will take,
     from the seconds of its first `step`; without an estimate, than `have`, the seconds that it has
-    from its first iteration on. None where it will take about what it has."""
-    expected = seconds * count_spent(1.0) / count_spent(max(step, 1) / iterations)
+    from its first iteration on. None where it will take about what it has. slower: `Started.slower`."""
+    expected = seconds * count_spent(1.0, slower) / count_spent(max(step, 1) / iterations, slower)
     if CLOSE[0] <= expected / max(have, 1e-9) <= CLOSE[1]:
         return None
     return expected / 60 / minutes if minutes else expected / max(have, 1e-9)

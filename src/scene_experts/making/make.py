@@ -34,7 +34,7 @@ from scene_experts.sfm.panoramas import cuts
 from scene_experts.sfm.photos import HEIC, find_photos, list_files
 from scene_experts.sfm.reconstruct import NOTE, check_request, reconstruct
 from scene_experts.training import run_folder
-from scene_experts.training.events import Event, Stepped
+from scene_experts.training.events import Event, Started, Stepped
 from scene_experts.training.recipes import PROPOSED
 
 CAPTURE, RUN, PAGE, SOURCE = "capture", "run", "scene.html", "source.json"
@@ -234,6 +234,8 @@ def train(plan: TrainingPlan, folder: Path, budget: TimeBudget, progress: Whole,
         trainer = Trainer(plan.recipe, plan.capture, folder, resume=begun, overwrite=not begun, preview_every=0, save_every=SAVE_EVERY)
         recent: list[Stepped] = []
         for event in saved_when_interrupted(trainer):
+            if isinstance(event, Started):
+                progress.slower = event.slower
             if not isinstance(event, Stepped):
                 continue
             progress(TRAINING, event.step, plan.recipe.iterations)

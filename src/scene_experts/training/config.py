@@ -65,6 +65,9 @@ class Train:
     random_background_from: Annotated[int, Range(0), SCALES] = 0
     """Iteration after which the background is random; until then it is that of the capture.
     --iterations rescales it."""
+    half_until: Annotated[int, Range(0), SCALES] = 0
+    """Until this iteration, see photographs of 800 px and more (the longest side) at half their size:
+    fewer pixels are drawn, and growth needs no more. --iterations rescales it; 0: see them as they are."""
     dense_views: CountOrNone = 0
     """With at most this many training views, and fewer than 26,000 points, start from points that a
     plane sweep finds in them, unless --init or --points says where to start."""

@@ -30,6 +30,9 @@ class Started:
     """What the scene starts from: how many points were computed of what, and depth maps that count."""
     gradients: str = ""
     """On a GPU: whether training views are differentiated without autograd, and why not."""
+    slower: float = 1.0
+    """How many times longer an iteration takes once it sees photographs as they are
+    (--half-until)."""
 
 
 @dataclass(frozen=True)

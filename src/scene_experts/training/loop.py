@@ -24,6 +24,7 @@ from scene_experts.strategy.survey import Survey, TrainingPhoto
 from scene_experts.training.batch import Direct, check_batch, make_exchange
 from scene_experts.training.config import Train
 from scene_experts.training.direct import DirectStep
+from scene_experts.training.early import find_slower, shrink
 from scene_experts.training.events import Densified, Event, Finished, Previewed, Saved, Started, Stopped
 from scene_experts.training.guard import check_finite, explain, find_broken
 from scene_experts.training.job import Job, last_iteration
@@ -69,7 +70,8 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
     about = training.scene.describe_decode(training.step + 1)
     direct = direct_of(training, rasterize, training.scene)
     gradients = "" if direct is None else "through autograd (--shard)" if run.shard else direct.describe(training.scene, training.step + 1)
-    yield Started(training.step, total, training.scene.table.total, training.scene.traits, about, training.computed, gradients)
+    slower = find_slower(cfg, [capture.views[index].camera for index in capture.train])
+    yield Started(training.step, total, training.scene.table.total, training.scene.traits, about, training.computed, gradients, slower)
     saved = training.step
     parts: Mapping[str, Tensor] = {}  # terms of the last iteration
     while training.step < total and not exchange.stopping:
@@ -156,7 +158,8 @@ def iterate(training: Training, run: Job, capture: Capture, rasterize: Rasterize
         photographs.prefetch(upcoming[turn : turn + AHEAD])
         done = None  # frees the memory of the previous view
         turn_views = range(place - run.group.rank, place - run.group.rank + run.group.size)
-        cameras = [capture.views[batch[other][0]].camera.to(run.device, run.dtype) for other in turn_views]
+        cameras = [shrink(cfg, numbers[other], capture.views[batch[other][0]].camera)[0] for other in turn_views]
+        cameras = [camera.to(run.device, run.dtype) for camera in cameras]
         shown = exchange.scene_of(cameras, numbers[turn_views[0]], Mode.TRAIN, rasterize.visible)
         done = see_view(training, run, capture, rasterize, numbers[place], *batch[place], scene=shown)
         del shown
@@ -225,9 +228,10 @@ def see_view(
     None is the scene of the training.
     """
     cfg, scene = training.cfg, scene or training.scene
-    camera = capture.views[index].camera.to(run.device, run.dtype)
+    camera, by = shrink(cfg, number, capture.views[index].camera)
+    camera = camera.to(run.device, run.dtype)
     photographs = resident_of(training, run, capture)
-    target, mask = photographs.see(index)
+    target, mask = photographs.see(index, by)
     training.seed_view(number)
     direct, depth = direct_of(training, rasterize, scene), photographs.depth(index) if cfg.loss.depth else None
     if direct is not None and not direct.refused and depth is None:

@@ -26,20 +26,29 @@ other work; beside other processes 1.05 on South Building, 1.44 on bonsai, and 1
 older trainings (results/to-page.md)."""
 
 
-def count_spent(share: float) -> float:
+def count_spent(share: float, slower: float = 1.0) -> float:
     """Return the cost of the first `share` of a training. The unit is a whole training whose iterations
-    do not become longer."""
-    if torch.cuda.is_available():  # not measured there: iterations count alike
-        return share
-    return share + GROWN * (min(share, 0.5) ** 2 + max(0.0, share - 0.5))
+    do not become longer.
+
+    slower: How many times longer an iteration takes in the second half because it sees larger
+    photographs (`early.find_slower`).
+    """
+    return share if torch.cuda.is_available() else cost_on_cpu(share, slower)  # not measured there: iterations count alike
 
 
-def count_left(step: int, total: int) -> float:
+def cost_on_cpu(share: float, slower: float = 1.0) -> float:
+    """Return `count_spent` on a machine without a GPU."""
+    first = min(share, 0.5)
+    return first + GROWN * first**2 + (share - first) * (1 + GROWN) * slower
+
+
+def count_left(step: int, total: int, slower: float = 1.0) -> float:
     """Return how many iterations as long as the present one are left. On the CPU those of a growing
-    scene become longer."""
+    scene become longer. slower: See `count_spent`."""
     if torch.cuda.is_available():
         return total - step
-    return total * (count_spent(1.0) - count_spent(step / total)) / (1 + GROWN * min(2 * step / total, 1.0))
+    present = (1 + GROWN * min(2 * step / total, 1.0)) * (slower if 2 * step > total else 1.0)
+    return total * (count_spent(1.0, slower) - count_spent(step / total, slower)) / present
 
 
 class TrainingProgress:
@@ -65,6 +74,7 @@ class TrainingProgress:
     traits: Traits
     pictured: bool
     pace: Speedometer
+    slower: float
 
     def __init__(self, console: Console, every: float = 15.0, out: Path | None = None) -> None:
         self.console, self.every, self.out, self.pictured = console, every, out, False
@@ -72,7 +82,7 @@ class TrainingProgress:
         self.total, self.first, self.began, self.printed = 0, 0, time.perf_counter(), 0.0
         self.loss, self.psnr = {}, None
         self.traits = Traits("", "rows")
-        self.pace = Speedometer()
+        self.pace, self.slower = Speedometer(), 1.0
 
     def __enter__(self) -> TrainingProgress:
         if self.live:
@@ -88,7 +98,7 @@ class TrainingProgress:
         match event:
             case Started():
                 self.total, self.first, self.began = event.total, event.step, time.perf_counter()
-                self.pace = Speedometer()
+                self.pace, self.slower = Speedometer(), event.slower
                 verb = f"resumed at iteration {event.step:,}" if event.step else "started"
                 self.traits, rows = event.traits, event.traits.rows
                 lattice = f" on a lattice of {event.traits.voxel:.3g}" if event.traits.voxel else ""
@@ -132,7 +142,8 @@ class TrainingProgress:
             self.loss[name] = SMOOTHING * self.loss.get(name, value) + (1 - SMOOTHING) * value
         self.psnr = event.psnr if self.psnr is None else SMOOTHING * self.psnr + (1 - SMOOTHING) * event.psnr
         speed = self.pace(event.step)
-        left = "-:-- left" if speed is None else f"{format_duration(count_left(event.step, self.total) / speed)} left  {speed:.1f} it/s"
+        parts = count_left(event.step, self.total, self.slower)
+        left = "-:-- left" if speed is None else f"{format_duration(parts / speed)} left  {speed:.1f} it/s"
         terms = " ".join(f"{name} {value:.4f}" for name, value in self.loss.items())
         active = f"active {100 * event.active:.0f} %  " if self.traits.activation else ""
         line = (  # a narrow terminal cuts the end off
@@ -167,6 +178,7 @@ class ProgressBar:
     task: TaskID
     what: str
     pace: Speedometer
+    slower: float
 
     def __init__(self, console: Console, every: float = 15.0) -> None:
         self.console, self.every, self.printed = console, every, time.monotonic()

@@ -83,6 +83,7 @@ def _for_photographs(name: str) -> Train:
         plain,
         scene=replace(plain.scene, few_fall=AFTER_GROWTH),
         loss=replace(plain.loss, depth=0.2),
+        half_until=AFTER_GROWTH[0],
         dense_views=FEW,
         mean_background=True,
         near_share=0.5,

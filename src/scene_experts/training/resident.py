@@ -15,6 +15,14 @@ DEPTHS = 1 << 29  # bytes of depth maps that stay on a CPU
 AHEAD = 3  # threads that decode photographs for a GPU, as the cores are free
 
 
+def average(picture: Tensor, by: int, dtype: torch.dtype) -> Tensor:
+    """Return the means of the blocks of by x by pixels of a picture [H, W, ...]. Rows and columns that
+    fill no block are left out."""
+    height, width = picture.shape[0] // by * by, picture.shape[1] // by * by
+    parts = [picture[y:height:by, x:width:by].to(dtype) for y in range(by) for x in range(by)]
+    return torch.stack(parts).sum(0).div_(by * by)
+
+
 class Resident:
     """Photographs as a training sees them. On a GPU they stay there, 3 bytes a pixel, as far as the
     budget allows; the others are decoded ahead and copied each time.
@@ -34,9 +42,10 @@ class Resident:
         self.depths: dict[int, Tensor] = {}
         self.backgrounds: dict[tuple[float, ...], Tensor] = {}
 
-    def see(self, index: int) -> tuple[Tensor, Tensor | None]:
+    def see(self, index: int, by: int = 1) -> tuple[Tensor, Tensor | None]:
         """Return the photograph [H, W, 3] in [0, 1] and its mask [H, W] or None, as the device and
-        dtype want them. Raises InputError if its file cannot be read."""
+        dtype want them, at 1 / by of their size (`Camera.shrunk`). Raises InputError if its file cannot
+        be read."""
         pixels = self.kept.get(index)
         if pixels is None:
             frame = self.capture.frame(index)
@@ -45,6 +54,8 @@ class Resident:
             if self.used + size <= self.budget:
                 self.kept[index], self.used = pixels, self.used + size
         rgb, mask = pixels
+        if by > 1:
+            return average(rgb, by, self.dtype).div_(255.0), None if mask is None else average(mask, by, self.dtype)
         if self.device.type == "cuda" and self.dtype == torch.float32:
             return torch.div(rgb, 255.0), mask  # one kernel instead of two
         return rgb.to(self.dtype).div_(255.0), mask

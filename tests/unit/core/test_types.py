@@ -1,7 +1,9 @@
 """Cameras and Gaussians: the conventions that types.py states."""
 
 import math
+from dataclasses import replace
 
+import pytest
 import torch
 
 from scene_experts.core.types import Camera, Gaussians
@@ -29,6 +31,16 @@ def test_moving_changes_tensors_alone():
     made = camera().to(dtype=torch.float64)
     assert made.K.dtype == made.world_to_cam.dtype == torch.float64
     assert (made.width, made.height, made.near, made.id) == (64, 48, 0.2, 0) and camera().to("cpu").K.dtype == torch.float32
+
+
+def test_a_pixel_of_a_shrunken_camera_shows_a_block_of_its_own():
+    made = replace(camera(), height=49)
+    small = made.shrunk(2)
+    assert (small.width, small.height, small.near) == (32, 24, made.near) and made.shrunk(2) is small and made.shrunk(1) is made
+    point = torch.tensor([0.2, -0.1, 3.0])
+    for axis in range(2):
+        torch.testing.assert_close((small.K @ point)[axis], (made.K @ point)[axis] / 2)  # in px from the same corner
+    assert small.fov == pytest.approx(made.fov, rel=0.03) and (made.fx, made.cx) == (50.0, 31.0)
 
 
 def test_gaussians_are_counted_by_their_means():

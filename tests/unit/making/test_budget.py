@@ -63,6 +63,9 @@ def test_how_slow_the_machine_is_follows_from_the_first_iterations(monkeypatch):
     assert find_slowness(400, 40, 4.0, fits / 60 / 3, fits / 2) == pytest.approx(3, rel=0.01)
     assert find_slowness(400, 40, 4.0, None, fits / 2) == pytest.approx(2, rel=0.01)
     assert find_slowness(400, 40, 4.0, 1.0, 3 * fits) is not None
+    # with photographs at half their size until half of it, and iterations that take 3 times as long from there
+    assert find_slowness(400, 40, 4.0, None, 115.1, slower=3.0) is None
+    assert find_slowness(400, 40, 4.0, None, 115.1 / 2, slower=3.0) == pytest.approx(2, rel=0.01)
 
 
 def test_on_cuda_the_iterations_follow_from_the_measured_speed(monkeypatch):

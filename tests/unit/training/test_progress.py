@@ -98,8 +98,12 @@ def test_iterations_of_a_growing_scene_count_more(monkeypatch):
         assert count_left(step, 1000) == pytest.approx(sum(costs[step:]) / costs[step], rel=0.01)
         assert 1000 * count_spent(step / 1000) == pytest.approx(sum(costs[:step]), rel=0.01)
     assert sum(costs) / (10 * sum(costs[:100])) == pytest.approx(1.37, abs=0.01) and count_left(1000, 1000) == 0
+    costs[500:] = [3 * cost for cost in costs[500:]]  # photographs at their full size from then on
+    for step in (0, 100, 501, 900):
+        assert count_left(step, 1000, 3.0) == pytest.approx(sum(costs[step:]) / costs[step], rel=0.01)
+        assert 1000 * count_spent(step / 1000, 3.0) == pytest.approx(sum(costs[:step]), rel=0.01)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    assert count_left(100, 1000) == 900 and count_spent(0.1) == 0.1
+    assert count_left(100, 1000, 3.0) == 900 and count_spent(0.1, 3.0) == 0.1
 
 
 def test_durations_are_formatted():

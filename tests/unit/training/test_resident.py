@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from scene_experts.training.resident import Resident
+from scene_experts.training.resident import Resident, average
 from support.captures import load
 from support.depths import make_depths
 from support.synthetic import make_blender, make_capture
@@ -26,6 +26,22 @@ def test_a_photograph_is_the_same_kept_or_not(capture) -> None:
             assert torch.equal(none.see(index)[0], rgb)
             rgb.zero_()  # the caller's own
     assert set(two.kept) == {3, 0} and two.used == 2 * SIZE and not none.kept
+
+
+@pytest.mark.parametrize("shape, by", [((16, 24, 3), 2), ((17, 25, 3), 2), ((13, 9), 4)])
+def test_a_smaller_photograph_has_the_means_of_blocks(shape, by) -> None:
+    picture = torch.randint(0, 256, shape, dtype=torch.uint8)
+    planes = picture.double().view(*shape[:2], -1).permute(2, 0, 1)
+    expected = torch.nn.functional.avg_pool2d(planes, by).permute(1, 2, 0).reshape(shape[0] // by, shape[1] // by, *shape[2:])
+    torch.testing.assert_close(average(picture, by, torch.float64), expected)
+
+
+def test_a_smaller_photograph_has_the_size_of_its_camera(capture) -> None:
+    photographs = Resident(capture, "cpu", torch.float32)
+    rgb, mask = photographs.see(1, 2)
+    small = capture.views[1].camera.shrunk(2)
+    assert rgb.shape == (small.height, small.width, 3) and mask is None
+    torch.testing.assert_close(rgb, average(photographs.see(1)[0], 2, torch.float32))
 
 
 def test_only_photographs_that_are_not_kept_are_decoded_ahead(capture, monkeypatch: pytest.MonkeyPatch) -> None:
