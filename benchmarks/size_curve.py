@@ -75,11 +75,11 @@ def draw(rows: list[dict[str, Any]], place: Path) -> None:
                 for axis, score in zip(axes[:, column], ("psnr", "lpips")) if line else ():
                     x, y = [row["bytes"] / 1e6 for row in line], [row[score] for row in line]
                     named[label] = axis.plot(x, y, style, color=colour, marker=marker, markersize=4, linewidth=1.5)[0]
-        axes[0, column].set_title(capture, fontsize=10)
+        axes[0, column].set_title("South Building" if capture == "south" else capture, fontsize=10)
         for axis in axes[:, column]:
             axis.set_xscale("log")
             axis.grid(color="#e6e6e6", linewidth=0.6)
-            axis.xaxis.set_major_locator(FixedLocator([0.25, 0.5, 1, 2, 4, 8, 16]))
+            axis.xaxis.set_major_locator(FixedLocator([0.25, 0.5, 1, 2, 3, 4, 8, 16]))
             axis.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
             axis.xaxis.set_minor_formatter(NullFormatter())
             axis.tick_params(labelsize=8)
