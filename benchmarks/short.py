@@ -33,21 +33,20 @@ ONE = "import json, sys; sys.path.insert(0, sys.argv[1]); import short; print(js
 
 def train(capture: se.Capture, recipe: str, seconds: float, out: Path) -> dict[str, Any]:
     """Train for so many CPU seconds of this process from now on."""
-    from scene_experts.training.early import find_slower
-    from scene_experts.training.progress import cost_on_cpu
+    from scene_experts.training.course import find_course
 
     iterations = FIRST
     for attempt in range(ATTEMPTS):
         began, start, other = time.process_time(), 0.0, 0
         made = se.recipe(recipe, iterations=iterations)
-        slower = find_slower(made, capture.train_cameras)
+        course = find_course(made.scaled(), capture.train_cameras, cuda=False)
         trainer = se.Trainer(made, capture, out, overwrite=True, preview_every=0, save_every=iterations)
         for event in trainer:
             if isinstance(event, se.Started):
                 start = time.process_time()
             elif isinstance(event, se.Stepped) and attempt < ATTEMPTS - 1 and not other and event.step >= iterations // 10:
                 spent, loading = time.process_time() - start, start - began
-                training = spent * cost_on_cpu(1.0, slower) / cost_on_cpu(event.step / iterations, slower)
+                training = spent * course.spent(iterations) / course.spent(event.step)
                 other = iterations
                 if abs((loading + training) / seconds - 1) > CLOSE:
                     other = max(LEAST, round(iterations * (seconds - loading) / training))

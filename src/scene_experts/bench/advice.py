@@ -17,8 +17,9 @@ from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.numbers import number
 from scene_experts.core.version import __version__
 from scene_experts.render import choose, gsplat_install
-from scene_experts.training.early import slow_down
-from scene_experts.training.progress import cost_on_cpu
+from scene_experts.training.course import GROWN, Course
+from scene_experts.training.course import PER_MEGAPIXEL as SEEN
+from scene_experts.training.early import LEAST
 
 LIMIT = 8.0  # minutes, so that a capture of few photographs, its training, scores and page take a quarter of an hour together
 SIDES = ((0, 7000), (1200, 7000), (800, 7000), (800, 4000), (600, 4000), (600, 3000), (600, 2000), (400, 2000))
@@ -90,9 +91,24 @@ def recall_picture() -> float:
 def estimate_minutes(width: int, height: int, iterations: int, picture: float, threads: int) -> float:
     """Minutes of a training of the recipe that is proposed. picture: see `measure_picture`."""
     gain, pixels = 1 / (SERIAL + (1 - SERIAL) / threads), width * height / 1e6
-    slower = slow_down(width, height)  # the first half takes that much less
-    saved = cost_on_cpu(1.0, slower) / slower / cost_on_cpu(1.0)
-    return iterations * picture * (BASE + PER_MEGAPIXEL * pixels * min(1.0, pixels / MEASURED)) * saved / gain / 60
+    cost = cost_at(pixels)
+    if (side := max(width, height)) >= LEAST:  # but never less than what is just small enough to be seen as it is
+        cost = max(cost * share_of_half(pixels), cost_at(pixels * ((LEAST - 1) / side) ** 2))
+    return iterations * picture * cost / gain / 60
+
+
+def cost_at(pixels: float) -> float:
+    """Return how many times longer than `measure_picture` an iteration takes with so many megapixels, in
+    the mean of a training that sees all photographs as they are."""
+    return BASE + PER_MEGAPIXEL * pixels * min(1.0, pixels / MEASURED)
+
+
+def share_of_half(pixels: float) -> float:
+    """Return how many times longer a training takes that sees its photographs of so many megapixels at
+    half their size in the first half."""
+    slower = (1 + SEEN * pixels) / (1 + SEEN * pixels / 4)
+    half, whole = Course(2, GROWN, 1, slower), Course(2, GROWN)
+    return half.spent(2) / slower / whole.spent(2)
 
 
 def suggest(width: int, height: int, views: int, picture: float | None = None, limit: float | None = None) -> Advice:

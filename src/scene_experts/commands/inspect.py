@@ -8,6 +8,7 @@ from pathlib import Path
 from scene_experts.arguments.parse import Command, parse
 from scene_experts.commands import PROG
 from scene_experts.core.errors import InputError
+from scene_experts.core.io import read_json
 from scene_experts.data.fetch.catalog import defaults_in
 from scene_experts.data.settings import Data
 
@@ -31,7 +32,7 @@ def info(args: list[str]) -> int:
     if (run := is_run(data.path)) or is_scene(data.path):
         from scene_experts.commands.run_facts import print_file, print_run
 
-        if given := [word for word in args if word.startswith("-") and word not in ("-s", "--data")]:
+        if given := [word for word in args if word.startswith("-") and word.partition("=")[0] not in ("-s", "--data")]:
             what = "a run folder" if run else "a scene"
             raise InputError(f"expected no {given[0]} with {what}, found {data.path}; leave it out, or give a capture")
         (print_run if run else print_file)(data.path, console)
@@ -51,18 +52,25 @@ def is_run(folder: Path) -> bool:
 
 
 def is_scene(path: Path) -> bool:
-    """Whether a path is a file of a known format, a folder of SOG or a result folder, and no capture."""
+    """Whether a path is a file, or a folder with a SOG or a result and no capture."""
     from scene_experts.data.readers import is_capture
-    from scene_experts.files.registry import recognise, scene_file
+    from scene_experts.files.registry import scene_file
     from scene_experts.files.result_folder import is_result
 
-    if is_result(path) or not scene_file(path).is_file():
-        return is_result(path) and not is_capture(path)
+    if not path.is_dir():
+        return path.is_file()
+    result = is_result(path) and any(path.glob("point_cloud/iteration_*/point_cloud.ply"))
+    return (result or describes_scene(scene_file(path))) and not is_capture(path)
+
+
+def describes_scene(file: Path) -> bool:
+    """Whether a file is the description in a folder of SOG. Other programs have files of that name,
+    too."""
     try:
-        recognise(scene_file(path))
+        found = read_json(file, "description") if file.is_file() else None
     except InputError:
         return False
-    return not is_capture(path)
+    return isinstance(found, dict) and bool(found.keys() & {"means", "lodLevels"})
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.numbers import number
 from scene_experts.files.export import NAME
 from scene_experts.files.lone import open_scene
-from scene_experts.files.registry import recognise
+from scene_experts.files.registry import DESCRIPTIONS, recognise
 from scene_experts.files.scene_folder import world_of
 from scene_experts.training import run_folder
 from scene_experts.training.progress import format_duration
@@ -77,13 +77,26 @@ def find_file_facts(path: Path) -> dict[str, str]:
     trained = opened.step or note.get("step", 0)
     facts = {
         "file": str(source),
-        "format": f"{recognise(source)[0]}, {source.stat().st_size:,} bytes" if source.is_file() else "",
+        "format": _describe_format(source),
         scene.traits.rows: f"{len(scene.table):,}",
-        "extent": " x ".join(f"{side:.3g}" for side in sides.tolist()) + f" in the file's unit (98 % of the {scene.traits.rows})",
+        "extent": " x ".join(f"{side:.3g}" for side in sides.tolist())
+        + f" in the file's unit (1 % of the {scene.traits.rows} left out on each side)",
         "recipe": note.get("recipe", ""),
         "iterations": f"{trained:,}" if trained else "",
     }
     return {name: value for name, value in facts.items() if value}
+
+
+def _describe_format(source: Path) -> str:
+    """The name of a file's format, "anchors" for a result folder, and the bytes with all that belongs to
+    it."""
+    name, format = ("anchors", None) if source.is_dir() else recognise(source)
+    beside = source if source.is_dir() else source.parent if source.name in DESCRIPTIONS else None
+    if beside is not None:
+        size = sum(file.stat().st_size for file in beside.rglob("*") if file.is_file())
+    else:
+        size = format.size(source) if format and format.size else source.stat().st_size
+    return f"{name}, {size:,} bytes"
 
 
 def _extent(positions: Tensor) -> Tensor:

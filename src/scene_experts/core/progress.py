@@ -23,9 +23,9 @@ class Speedometer:
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
         self.now = now
-        self.times: deque[tuple[float, int]] = deque()
+        self.times: deque[tuple[float, float]] = deque()
 
-    def __call__(self, done: int) -> float | None:
+    def __call__(self, done: float) -> float | None:
         """Parts per second when `done` parts are done; None while too little is known."""
         now, times = self.now(), self.times
         if not times or done < times[-1][1]:

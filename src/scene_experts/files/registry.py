@@ -67,6 +67,7 @@ FAMILIES = {
 GAUSSIANS = "gaussians"  # the family whose files hold standard Gaussians; other scenes are baked for them
 DRAWN = "drawn"  # of formats that hold what a scene's pictures show, whatever it is made of
 ENTRY_POINTS = "scene_experts.formats"
+DESCRIPTIONS = ("lod-meta.json", "meta.json")  # of folders of SOG
 HEAD = 4096  # bytes that formats are recognised by
 _OWN_NAME = re.compile(r"scene(_level\d+)?(\.[^.]+)+")
 
@@ -275,7 +276,7 @@ def formats_of(family: str, names: Iterable[str] | None = None) -> dict[str, For
 def scene_file(path: Path) -> Path:
     """The file of the scene at `path`: the description in a folder of SOG, else `path` itself."""
     if path.is_dir():
-        return next((path / name for name in ("lod-meta.json", "meta.json") if (path / name).is_file()), path)
+        return next((path / name for name in DESCRIPTIONS if (path / name).is_file()), path)
     return path
 
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 
 from scene_experts.bench.advice import FEW, Advice, suggest
 from scene_experts.core.progress import Progress, Speedometer
-from scene_experts.training.progress import count_left, count_spent, format_duration
+from scene_experts.training.course import Course
+from scene_experts.training.progress import format_duration
 
 TRAINING = "training"  # the work whose parts become longer
 FOR_PAGE = 0.03  # share of the time after the poses that the page gets
@@ -61,7 +62,7 @@ class Whole:
 
     def __init__(self, progress: Progress, now: Callable[[], float] = time.monotonic) -> None:
         self.progress, self.now, self.what, self.pace = progress, now, "", Speedometer(now)
-        self.slower = 1.0  # `Started.slower` of the training
+        self.course: Course | None = None  # of the training
         self.later = 0.0  # seconds of the stages after this one
         self.least: Callable[[], float] = lambda: 0.0  # seconds that the whole takes in any case
 
@@ -69,12 +70,13 @@ class Whole:
         """Show that `done` of `total` parts of the work `what` are done."""
         if what != self.what:
             self.what, self.pace = what, Speedometer(self.now)
-        speed = self.pace(done)
+        course = self.course if what == TRAINING and self.course else Course(max(total, 1))
+        now = course.spent(done)
+        speed = self.pace(now)
         if speed is None or total <= 0:
             self.progress(what, done, total)
             return
-        parts = count_left(done, total, self.slower) if what == TRAINING else max(0, total - done)
-        left = max(parts / speed + self.later, self.least())
+        left = max(max(0.0, course.spent(total) - now) / speed + self.later, self.least())
         self.progress(f"{what} (about {format_duration(left)} left in all)", done, total)
 
 
@@ -101,11 +103,11 @@ def _within(iterations: float, views: int) -> int:
     return min(max(round(iterations), LEAST), MOST_OF_FEW if views <= FEW else MOST)
 
 
-def find_slowness(iterations: int, step: int, seconds: float, minutes: float | None, have: float, slower: float = 1.0) -> float | None:
-    """Return how many times longer than the estimated minutes a training of `iterations` will take,
+def find_slowness(course: Course, step: int, seconds: float, minutes: float | None, have: float) -> float | None:
+    """Return how many times longer than the estimated minutes a training of this course will take,
     from the seconds of its first `step`; without an estimate, than `have`, the seconds that it has
-    from its first iteration on. None where it will take about what it has. slower: `Started.slower`."""
-    expected = seconds * count_spent(1.0, slower) / count_spent(max(step, 1) / iterations, slower)
+    from its first iteration on. None where it will take about what it has."""
+    expected = seconds * course.spent(course.total) / course.spent(max(step, 1))
     if CLOSE[0] <= expected / max(have, 1e-9) <= CLOSE[1]:
         return None
     return expected / 60 / minutes if minutes else expected / max(have, 1e-9)

@@ -235,7 +235,7 @@ def train(plan: TrainingPlan, folder: Path, budget: TimeBudget, progress: Whole,
         recent: list[Stepped] = []
         for event in saved_when_interrupted(trainer):
             if isinstance(event, Started):
-                progress.slower = event.slower
+                progress.course = event.course
             if not isinstance(event, Stepped):
                 continue
             progress(TRAINING, event.step, plan.recipe.iterations)

@@ -19,7 +19,7 @@ from scene_experts.making.budget import LEAST, TimeBudget, find_slowness, plan_t
 from scene_experts.sfm.drift import drifts
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
-from scene_experts.training.early import find_slower
+from scene_experts.training.course import find_course
 from scene_experts.training.events import Stepped
 from scene_experts.training.recipes import PROPOSED
 
@@ -55,8 +55,8 @@ class TrainingPlan:
         """Return another plan for the `left` seconds, if the speed until now says that this one takes
         much more or less and the other one pays."""
         minutes = self.advice.minutes if self.advice else None
-        slower = find_slower(self.recipe, self.capture.train_cameras)
-        slow = find_slowness(self.recipe.iterations, event.step, event.seconds, minutes, event.seconds + left, slower)
+        course = find_course(self.recipe.scaled(), self.capture.train_cameras)
+        slow = find_slowness(course, event.step, event.seconds, minutes, event.seconds + left)
         if slow is None:
             return None
         other = self.fit(left, slow if minutes else slow * self.slow)

@@ -67,7 +67,8 @@ class Train:
     --iterations rescales it."""
     half_until: Annotated[int, Range(0), SCALES] = 0
     """Until this iteration, see photographs of 800 px and more (the longest side) at half their size:
-    fewer pixels are drawn, and growth needs no more. --iterations rescales it; 0: see them as they are."""
+    fewer pixels are drawn, and growth needs no more. The training PSNR is that of what is seen.
+    --iterations rescales it; 0: see them as they are."""
     dense_views: CountOrNone = 0
     """With at most this many training views, and fewer than 26,000 points, start from points that a
     plane sweep finds in them, unless --init or --points says where to start."""

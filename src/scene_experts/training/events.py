@@ -9,6 +9,7 @@ from torch import Tensor
 
 from scene_experts.scene import Traits
 from scene_experts.strategy import Edit
+from scene_experts.training.course import Course
 
 
 @dataclass(frozen=True)
@@ -30,9 +31,8 @@ class Started:
     """What the scene starts from: how many points were computed of what, and depth maps that count."""
     gradients: str = ""
     """On a GPU: whether training views are differentiated without autograd, and why not."""
-    slower: float = 1.0
-    """How many times longer an iteration takes once it sees photographs as they are
-    (--half-until)."""
+    course: Course | None = None
+    """How long its iterations are expected to take, relative to each other; None: all alike."""
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,9 @@ from scene_experts.scene.poses import at_pose, attach
 from scene_experts.strategy.survey import Survey, TrainingPhoto
 from scene_experts.training.batch import Direct, check_batch, make_exchange
 from scene_experts.training.config import Train
+from scene_experts.training.course import find_course
 from scene_experts.training.direct import DirectStep
-from scene_experts.training.early import find_slower, shrink
+from scene_experts.training.early import shrink
 from scene_experts.training.events import Densified, Event, Finished, Previewed, Saved, Started, Stopped
 from scene_experts.training.guard import check_finite, explain, find_broken
 from scene_experts.training.job import Job, last_iteration
@@ -70,8 +71,8 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
     about = training.scene.describe_decode(training.step + 1)
     direct = direct_of(training, rasterize, training.scene)
     gradients = "" if direct is None else "through autograd (--shard)" if run.shard else direct.describe(training.scene, training.step + 1)
-    slower = find_slower(cfg, [capture.views[index].camera for index in capture.train])
-    yield Started(training.step, total, training.scene.table.total, training.scene.traits, about, training.computed, gradients, slower)
+    course = find_course(cfg, [capture.views[index].camera for index in capture.train])
+    yield Started(training.step, total, training.scene.table.total, training.scene.traits, about, training.computed, gradients, course)
     saved = training.step
     parts: Mapping[str, Tensor] = {}  # terms of the last iteration
     while training.step < total and not exchange.stopping:

@@ -6,7 +6,6 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-import torch
 from rich.console import Console
 from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
@@ -15,40 +14,10 @@ from rich.text import Text
 
 from scene_experts.core.progress import Speedometer
 from scene_experts.scene import Traits
+from scene_experts.training.course import Course
 from scene_experts.training.events import Densified, Event, Exported, Finished, Previewed, Saved, Started, Stepped, Stopped
 
 SMOOTHING = 0.9  # weight of the previous value in the running means of loss and PSNR
-
-GROWN = 0.6
-"""Iterations become this much longer on a CPU once a scene has grown, in the second half. A whole
-training takes 1.37 times ten first tenths then. Measured were 1.17 to 1.33 in five on banana without
-other work; beside other processes 1.05 on South Building, 1.44 on bonsai, and 1.3 to 2.6 in eight
-older trainings (results/to-page.md)."""
-
-
-def count_spent(share: float, slower: float = 1.0) -> float:
-    """Return the cost of the first `share` of a training. The unit is a whole training whose iterations
-    do not become longer.
-
-    slower: How many times longer an iteration takes in the second half because it sees larger
-    photographs (`early.find_slower`).
-    """
-    return share if torch.cuda.is_available() else cost_on_cpu(share, slower)  # not measured there: iterations count alike
-
-
-def cost_on_cpu(share: float, slower: float = 1.0) -> float:
-    """Return `count_spent` on a machine without a GPU."""
-    first = min(share, 0.5)
-    return first + GROWN * first**2 + (share - first) * (1 + GROWN) * slower
-
-
-def count_left(step: int, total: int, slower: float = 1.0) -> float:
-    """Return how many iterations as long as the present one are left. On the CPU those of a growing
-    scene become longer. slower: See `count_spent`."""
-    if torch.cuda.is_available():
-        return total - step
-    present = (1 + GROWN * min(2 * step / total, 1.0)) * (slower if 2 * step > total else 1.0)
-    return total * (count_spent(1.0, slower) - count_spent(step / total, slower)) / present
 
 
 class TrainingProgress:
@@ -74,7 +43,8 @@ class TrainingProgress:
     traits: Traits
     pictured: bool
     pace: Speedometer
-    slower: float
+    cost: Speedometer
+    course: Course
 
     def __init__(self, console: Console, every: float = 15.0, out: Path | None = None) -> None:
         self.console, self.every, self.out, self.pictured = console, every, out, False
@@ -82,7 +52,7 @@ class TrainingProgress:
         self.total, self.first, self.began, self.printed = 0, 0, time.perf_counter(), 0.0
         self.loss, self.psnr = {}, None
         self.traits = Traits("", "rows")
-        self.pace, self.slower = Speedometer(), 1.0
+        self.pace, self.cost, self.course = Speedometer(), Speedometer(), Course(1)
 
     def __enter__(self) -> TrainingProgress:
         if self.live:
@@ -98,7 +68,7 @@ class TrainingProgress:
         match event:
             case Started():
                 self.total, self.first, self.began = event.total, event.step, time.perf_counter()
-                self.pace, self.slower = Speedometer(), event.slower
+                self.pace, self.cost, self.course = Speedometer(), Speedometer(), event.course or Course(event.total)
                 verb = f"resumed at iteration {event.step:,}" if event.step else "started"
                 self.traits, rows = event.traits, event.traits.rows
                 lattice = f" on a lattice of {event.traits.voxel:.3g}" if event.traits.voxel else ""
@@ -141,9 +111,10 @@ class TrainingProgress:
         for name, value in event.terms.items():
             self.loss[name] = SMOOTHING * self.loss.get(name, value) + (1 - SMOOTHING) * value
         self.psnr = event.psnr if self.psnr is None else SMOOTHING * self.psnr + (1 - SMOOTHING) * event.psnr
-        speed = self.pace(event.step)
-        parts = count_left(event.step, self.total, self.slower)
-        left = "-:-- left" if speed is None else f"{format_duration(parts / speed)} left  {speed:.1f} it/s"
+        done = self.course.spent(event.step)
+        speed, pace = self.pace(event.step), self.cost(done)
+        known = speed is not None and pace is not None
+        left = f"{format_duration((self.course.spent(self.total) - done) / pace)} left  {speed:.1f} it/s" if known else "-:-- left"
         terms = " ".join(f"{name} {value:.4f}" for name, value in self.loss.items())
         active = f"active {100 * event.active:.0f} %  " if self.traits.activation else ""
         line = (  # a narrow terminal cuts the end off
@@ -178,7 +149,6 @@ class ProgressBar:
     task: TaskID
     what: str
     pace: Speedometer
-    slower: float
 
     def __init__(self, console: Console, every: float = 15.0) -> None:
         self.console, self.every, self.printed = console, every, time.monotonic()

@@ -15,12 +15,14 @@ DEPTHS = 1 << 29  # bytes of depth maps that stay on a CPU
 AHEAD = 3  # threads that decode photographs for a GPU, as the cores are free
 
 
-def average(picture: Tensor, by: int, dtype: torch.dtype) -> Tensor:
-    """Return the means of the blocks of by x by pixels of a picture [H, W, ...]. Rows and columns that
-    fill no block are left out."""
+def average(picture: Tensor, by: int) -> Tensor:
+    """Return the means of the blocks of by x by pixels of a picture [H, W, ...], in float32 for whole
+    numbers. Rows and columns that fill no block are left out."""
     height, width = picture.shape[0] // by * by, picture.shape[1] // by * by
-    parts = [picture[y:height:by, x:width:by].to(dtype) for y in range(by) for x in range(by)]
-    return torch.stack(parts).sum(0).div_(by * by)
+    total = picture[0:height:by, 0:width:by].to(picture.dtype if picture.is_floating_point() else torch.float32, copy=True)
+    for place in range(1, by * by):
+        total += picture[place // by : height : by, place % by : width : by]
+    return total.div_(by * by)
 
 
 class Resident:
@@ -55,7 +57,11 @@ class Resident:
                 self.kept[index], self.used = pixels, self.used + size
         rgb, mask = pixels
         if by > 1:
-            return average(rgb, by, self.dtype).div_(255.0), None if mask is None else average(mask, by, self.dtype)
+            if mask is None:
+                return average(rgb, by).to(self.dtype).div_(255.0), None
+            counted = average(mask, by)  # a block has the mean of its pixels that count
+            colors = average(rgb.to(self.dtype) * mask[..., None], by) / counted[..., None].clamp_min(1e-6)
+            return colors.div_(255.0), counted
         if self.device.type == "cuda" and self.dtype == torch.float32:
             return torch.div(rgb, 255.0), mask  # one kernel instead of two
         return rgb.to(self.dtype).div_(255.0), mask

@@ -12,8 +12,8 @@ def test_the_measured_picture_takes_time():
 def test_twice_the_iterations_take_twice_the_time_and_threads_save_some():
     one, two = (advice.estimate_minutes(800, 600, n, 0.015, 1) for n in (1000, 2000))
     assert two == pytest.approx(2 * one)
-    # 2,000 iterations x 15 ms x (5 + 9.5 x 0.48 x 0.48 / 1.08) = 210.8 s, the first half at half the size
-    assert two == pytest.approx(210.8 / 60 * (0.65 / 1.973 + 0.8) / 1.45, rel=1e-3)
+    # 2,000 iterations x 15 ms x (5 + 9.5 x 0.48 x 0.48 / 1.08) = 210.8 s
+    assert two == pytest.approx(210.8 / 60, rel=3e-3)
     assert advice.estimate_minutes(800, 600, 1000, 0.015, 2) == pytest.approx(one * (0.15 + 0.85 / 2))
 
 
@@ -51,10 +51,10 @@ def test_a_busy_machine_is_told_with_its_share():
     assert advice.Advice(800, 300, 0.52).tell(0.5) == "about 60 s beside what else this machine does now (about 30 s alone)"
 
 
-def test_half_of_a_training_on_large_photographs_counts_as_one_on_smaller_ones():
-    """Below 800 px as ever; above, the first half (0.65 of 1.45) takes as many times less as its
-    iterations are faster."""
-    seconds = [advice.estimate_minutes(side, 600, 1000, 0.015, 1) for side in (799, 800)]
-    whole = [advice.BASE + advice.PER_MEGAPIXEL * (side * 600 / 1e6) ** 2 / advice.MEASURED for side in (799, 800)]
-    slower = advice.slow_down(800, 600)
-    assert seconds[1] / whole[1] * whole[0] / seconds[0] == pytest.approx((0.65 / slower + 0.8) / 1.45) and 1.5 < slower < 2.5
+def test_half_the_size_at_first_takes_less_but_never_less_than_smaller_photographs():
+    assert advice.share_of_half(0.4) == pytest.approx(0.84, abs=0.01)  # fox 0.82, banana 0.865
+    assert 0.70 < advice.share_of_half(1.9) < advice.share_of_half(1.08) < 0.80
+    minutes = [advice.estimate_minutes(side, side * 3 // 4, 1000, 0.015, 1) for side in (400, 600, 799, 800, 1000, 1200, 1600)]
+    assert minutes == sorted(minutes)
+    whole = 1000 * 0.015 * advice.cost_at(1.6 * 1.2) / 60
+    assert minutes[-1] == pytest.approx(whole * advice.share_of_half(1.6 * 1.2))

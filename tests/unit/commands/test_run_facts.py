@@ -1,6 +1,7 @@
 """`info RUN`: the facts of a run folder."""
 
 import shutil
+import zipfile
 
 import pytest
 
@@ -51,9 +52,22 @@ def test_a_result_folder_has_facts_and_a_file_of_something_else_is_no_scene(run,
     shutil.copytree(run / "point_cloud", tmp_path / "result/point_cloud")
     assert inspect.is_scene(tmp_path / "result") and "anchors" in find_file_facts(tmp_path / "result")
     (tmp_path / "notes.txt").write_text("nothing")
-    assert not inspect.is_scene(tmp_path / "notes.txt")
-    with pytest.raises(InputError, match="found a file"):
+    with pytest.raises(InputError, match="expected a file of a known format"):
         inspect.info([str(tmp_path / "notes.txt")])
+
+
+def test_folders_with_files_of_such_names_are_no_scenes(run, tmp_path):
+    for text in ("{}", "no JSON", "[1]"):
+        (tmp_path / "meta.json").write_text(text)
+        assert not inspect.is_scene(tmp_path)
+    (tmp_path / "point_cloud").mkdir()
+    assert not inspect.is_scene(tmp_path) and not inspect.is_scene(tmp_path / "nothing")
+    sog = se.open_run(run).export("sog", tmp_path / "a.sog")
+    with zipfile.ZipFile(sog) as packed:
+        packed.extractall(tmp_path / "folder")
+    size = sum(file.stat().st_size for file in (tmp_path / "folder").iterdir())
+    assert inspect.is_scene(tmp_path / "folder") and find_file_facts(tmp_path / "folder")["format"] == f"sog, {size:,} bytes"
+    assert inspect.info([f"--data={tmp_path / 'folder'}"]) == 0
 
 
 def test_scores_are_told_with_their_iteration_and_damaged_ones_are_none(tmp_path):

@@ -1,7 +1,6 @@
 """How the minutes of a call are divided, and what is told about the time left."""
 
 import pytest
-import torch
 
 from scene_experts.bench import advice
 from scene_experts.making.budget import (
@@ -15,6 +14,7 @@ from scene_experts.making.budget import (
     find_slowness,
     plan_training,
 )
+from scene_experts.training.course import GROWN, Course
 
 
 class Clock:
@@ -55,17 +55,17 @@ def test_a_training_fills_the_time_that_it_has(monkeypatch):
         assert first.minutes == pytest.approx(FIRST * proposed.minutes)
 
 
-def test_how_slow_the_machine_is_follows_from_the_first_iterations(monkeypatch):
+def test_how_slow_the_machine_is_follows_from_the_first_iterations():
     """400 iterations, of which the first 40 took 4 s: all take 54.7 s."""
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    fits = 54.7
-    assert find_slowness(400, 40, 4.0, 1.0, fits) is None and find_slowness(400, 40, 4.0, 1.0, 1.1 * fits) is None
-    assert find_slowness(400, 40, 4.0, fits / 60 / 3, fits / 2) == pytest.approx(3, rel=0.01)
-    assert find_slowness(400, 40, 4.0, None, fits / 2) == pytest.approx(2, rel=0.01)
-    assert find_slowness(400, 40, 4.0, 1.0, 3 * fits) is not None
+    course, fits = Course(400, GROWN), 54.7
+    assert find_slowness(course, 40, 4.0, 1.0, fits) is None and find_slowness(course, 40, 4.0, 1.0, 1.1 * fits) is None
+    assert find_slowness(course, 40, 4.0, fits / 60 / 3, fits / 2) == pytest.approx(3, rel=0.01)
+    assert find_slowness(course, 40, 4.0, None, fits / 2) == pytest.approx(2, rel=0.01)
+    assert find_slowness(course, 40, 4.0, 1.0, 3 * fits) is not None
     # with photographs at half their size until half of it, and iterations that take 3 times as long from there
-    assert find_slowness(400, 40, 4.0, None, 115.1, slower=3.0) is None
-    assert find_slowness(400, 40, 4.0, None, 115.1 / 2, slower=3.0) == pytest.approx(2, rel=0.01)
+    course = Course(400, GROWN, 200, 3.0)
+    assert find_slowness(course, 40, 4.0, None, 115.1) is None
+    assert find_slowness(course, 40, 4.0, None, 115.1 / 2) == pytest.approx(2, rel=0.01)
 
 
 def test_on_cuda_the_iterations_follow_from_the_measured_speed(monkeypatch):

@@ -34,15 +34,6 @@ def test_only_large_photographs_are_seen_small_and_only_at_first(folder) -> None
     assert early.shrink(replace(cfg, half_until=0), 1, large) == (large, 1)
 
 
-def test_how_much_longer_iterations_become_depends_on_the_pixels(folder) -> None:
-    assert early.slow_down(799, 799) == 1.0 and early.slow_down(800, 450) == pytest.approx(12.1 / 6.6, rel=0.03)
-    assert 2.5 < early.slow_down(1200, 900) < early.slow_down(1600, 1200) < 4.0
-    small, large = load(folder).views[0].camera, replace(load(folder).views[0].camera, width=800, height=450)
-    cfg = replace(config(), half_until=1)
-    assert early.find_slower(cfg, [small, large]) == pytest.approx((1 + early.slow_down(800, 450)) / 2)
-    assert early.find_slower(cfg, [small]) == early.find_slower(replace(cfg, half_until=0), [large]) == early.find_slower(cfg, []) == 1.0
-
-
 def test_a_training_sees_its_photographs_small_until_that_iteration(folder, monkeypatch) -> None:
     monkeypatch.setattr(early, "LEAST", 1)
     capture, heights = load(folder), {}

@@ -1,15 +1,15 @@
 import io
 from pathlib import Path
 
-import pytest
 import torch
 from rich.console import Console
 
 from scene_experts.core.progress import Speedometer
 from scene_experts.scene import Traits
 from scene_experts.strategy import Edit
+from scene_experts.training.course import Course
 from scene_experts.training.events import Densified, Exported, Finished, Previewed, Saved, Started, Stepped, Stopped
-from scene_experts.training.progress import GROWN, ProgressBar, TrainingProgress, count_left, count_spent, format_duration
+from scene_experts.training.progress import ProgressBar, TrainingProgress, format_duration
 
 
 def test_a_log_file_gets_plain_lines():
@@ -88,22 +88,21 @@ def test_the_time_left_is_that_of_the_measured_speed(monkeypatch):
             show(Stepped(step, {"l1": 0.05}, 21.5, 1300, 800, 4000, 0.61, 1.0, {}))
             clock[0] += 4.0
     first, second = [line for line in out.getvalue().splitlines() if "/200" in line]
-    assert "-:-- left" in first and f"{format_duration(count_left(50, 200) / 10)} left  10.0 it/s" in second
+    assert "-:-- left" in first and "0:15 left  10.0 it/s" in second
 
 
-def test_iterations_of_a_growing_scene_count_more(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    costs = [1 + GROWN * min(2 * i / 1000, 1) for i in range(1000)]
-    for step in (0, 100, 500, 900):
-        assert count_left(step, 1000) == pytest.approx(sum(costs[step:]) / costs[step], rel=0.01)
-        assert 1000 * count_spent(step / 1000) == pytest.approx(sum(costs[:step]), rel=0.01)
-    assert sum(costs) / (10 * sum(costs[:100])) == pytest.approx(1.37, abs=0.01) and count_left(1000, 1000) == 0
-    costs[500:] = [3 * cost for cost in costs[500:]]  # photographs at their full size from then on
-    for step in (0, 100, 501, 900):
-        assert count_left(step, 1000, 3.0) == pytest.approx(sum(costs[step:]) / costs[step], rel=0.01)
-        assert 1000 * count_spent(step / 1000, 3.0) == pytest.approx(sum(costs[:step]), rel=0.01)
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    assert count_left(100, 1000, 3.0) == 900 and count_spent(0.1, 3.0) == 0.1
+def test_the_time_left_counts_iterations_that_take_longer(monkeypatch):
+    """From 10 to 50 of 200 iterations in 4 s, and iterations after 100 that take 3 times as long."""
+    out, clock = io.StringIO(), [0.0]
+    monkeypatch.setattr("scene_experts.training.progress.Speedometer", lambda: Speedometer(lambda: clock[0]))
+    with TrainingProgress(Console(file=out, width=200), every=0.0) as show:
+        show(Started(0, 200, 1234, Traits("anchors", "anchors"), course=Course(200, 0.0, 100, 3.0)))
+        for step, seconds in ((10, 4.0), (50, 5.0), (100, 3.0), (110, 0.0)):
+            show(Stepped(step, {"l1": 0.05}, 21.5, 1300, 800, 4000, 0.61, 1.0, {}))
+            clock[0] += seconds
+    told = [line.split(" left")[0].split()[-1] for line in out.getvalue().splitlines() if "/200" in line]
+    assert told[1] == "0:35"  # 50 and 3 x 100 at 10 a second
+    assert told[3] == "0:27"  # 3 x 90 at 10 a second: the speed in the cost's unit does not change
 
 
 def test_durations_are_formatted():

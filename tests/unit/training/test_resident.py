@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from scene_experts.data.views import Frame
 from scene_experts.training.resident import Resident, average
 from support.captures import load
 from support.depths import make_depths
@@ -33,7 +34,8 @@ def test_a_smaller_photograph_has_the_means_of_blocks(shape, by) -> None:
     picture = torch.randint(0, 256, shape, dtype=torch.uint8)
     planes = picture.double().view(*shape[:2], -1).permute(2, 0, 1)
     expected = torch.nn.functional.avg_pool2d(planes, by).permute(1, 2, 0).reshape(shape[0] // by, shape[1] // by, *shape[2:])
-    torch.testing.assert_close(average(picture, by, torch.float64), expected)
+    torch.testing.assert_close(average(picture.double(), by), expected)
+    torch.testing.assert_close(average(picture, by), expected.float())
 
 
 def test_a_smaller_photograph_has_the_size_of_its_camera(capture) -> None:
@@ -41,7 +43,20 @@ def test_a_smaller_photograph_has_the_size_of_its_camera(capture) -> None:
     rgb, mask = photographs.see(1, 2)
     small = capture.views[1].camera.shrunk(2)
     assert rgb.shape == (small.height, small.width, 3) and mask is None
-    torch.testing.assert_close(rgb, average(photographs.see(1)[0], 2, torch.float32))
+    torch.testing.assert_close(rgb, average(photographs.see(1)[0], 2))
+
+
+def test_pixels_that_do_not_count_colour_no_block() -> None:
+    class Masked:
+        mask = torch.tensor([[1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]])
+
+        def frame(self, index: int) -> Frame:
+            return Frame(torch.tensor([200, 0, 90, 90], dtype=torch.uint8)[None, :, None].expand(2, 4, 3), self.mask)
+
+    rgb, mask = Resident(Masked(), "cpu", torch.float32).see(0, 2)  # type: ignore[arg-type]
+    assert mask is not None and mask.tolist() == [[0.5, 0.0]]
+    torch.testing.assert_close(rgb[0, 0], torch.full((3,), 200 / 255))
+    assert rgb.isfinite().all()
 
 
 def test_only_photographs_that_are_not_kept_are_decoded_ahead(capture, monkeypatch: pytest.MonkeyPatch) -> None:
