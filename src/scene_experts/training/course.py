@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import torch
 
-from scene_experts.core.types import Camera
 from scene_experts.training.config import Train
-from scene_experts.training.early import is_shrunk
+from scene_experts.training.early import PictureSize, is_shrunk
 
 GROWN = 0.6
 """Iterations become this much longer on a CPU once a scene has grown, in the second half. A whole
@@ -45,7 +44,7 @@ class Course:
         return step + self.grown * (growing**2 / self.total + step - growing)
 
 
-def find_course(cfg: Train, cameras: Sequence[Camera], cuda: bool | None = None) -> Course:
+def find_course(cfg: Train, cameras: Sequence[PictureSize], cuda: bool | None = None) -> Course:
     """Return the course of a training on this machine. On a GPU nothing was measured: its iterations
     count alike.
 
@@ -59,7 +58,7 @@ def find_course(cfg: Train, cameras: Sequence[Camera], cuda: bool | None = None)
     return Course(cfg.iterations, GROWN, cfg.half_until, slower)
 
 
-def cost_of(camera: Camera, by: int = 1) -> float:
+def cost_of(camera: PictureSize, by: int = 1) -> float:
     """Return what an iteration with a photograph of this camera costs on a CPU, relative to one that
     draws no pixel. by: How many times smaller the photograph is seen."""
     return 1 + PER_MEGAPIXEL * camera.width * camera.height / by**2 / 1e6

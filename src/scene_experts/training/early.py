@@ -6,6 +6,8 @@ Before the details can be learned, half of the size shows as much of the scene f
 
 from __future__ import annotations
 
+from typing import Protocol
+
 from scene_experts.core.types import Camera
 from scene_experts.training.config import Train
 
@@ -14,7 +16,21 @@ LEAST = 800
 the scene takes most of the time."""
 
 
-def is_shrunk(camera: Camera) -> bool:
+class PictureSize(Protocol):
+    """A camera, as far as the size of its pictures is concerned."""
+
+    @property
+    def width(self) -> int:
+        """Pixels of a row."""
+        ...
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        ...
+
+
+def is_shrunk(camera: PictureSize) -> bool:
     """Whether the photograph of a training view is large enough to be seen at half its size at
     first."""
     return max(camera.width, camera.height) >= LEAST

@@ -113,8 +113,9 @@ class TrainingProgress:
         self.psnr = event.psnr if self.psnr is None else SMOOTHING * self.psnr + (1 - SMOOTHING) * event.psnr
         done = self.course.spent(event.step)
         speed, pace = self.pace(event.step), self.cost(done)
-        known = speed is not None and pace is not None
-        left = f"{format_duration((self.course.spent(self.total) - done) / pace)} left  {speed:.1f} it/s" if known else "-:-- left"
+        left = "-:-- left"
+        if speed is not None and pace is not None:
+            left = f"{format_duration((self.course.spent(self.total) - done) / pace)} left  {speed:.1f} it/s"
         terms = " ".join(f"{name} {value:.4f}" for name, value in self.loss.items())
         active = f"active {100 * event.active:.0f} %  " if self.traits.activation else ""
         line = (  # a narrow terminal cuts the end off
