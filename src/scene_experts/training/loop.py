@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -30,7 +29,7 @@ from scene_experts.training.events import Densified, Event, Finished, Previewed,
 from scene_experts.training.guard import check_finite, explain, find_broken
 from scene_experts.training.job import Job, last_iteration
 from scene_experts.training.losses import Sample, compute_terms
-from scene_experts.training.measure import Iteration, measure_step
+from scene_experts.training.measure import Iteration, measure_step, without_graph
 from scene_experts.training.memory import anchor_cap, give_back, peak_bytes
 from scene_experts.training.resident import AHEAD, Resident
 from scene_experts.training.sensitivity import MOST_VIEWS, evenly, find_sensitivity
@@ -290,20 +289,6 @@ def survey_of(training: Training, run: Job, capture: Capture, rasterize: Rasteri
         return TrainingPhoto(camera, image if exposures is None else exposures.undo(image, camera), mask)
 
     return Survey(capture.train, photo, rasterize, resident_of(training, run, capture).background(None))
-
-
-def without_graph(value: Any) -> Any:
-    """Return the same value with every tensor detached, so that the buffers of the autograd graph
-    can be freed."""
-    if isinstance(value, Tensor):
-        return value.detach()
-    if isinstance(value, (tuple, list)):
-        return type(value)(without_graph(item) for item in value)
-    if isinstance(value, dict):
-        return {name: without_graph(item) for name, item in value.items()}
-    if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{f.name: without_graph(getattr(value, f.name)) for f in fields(value) if f.init})
-    return value
 
 
 @torch.no_grad()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -67,3 +68,17 @@ def use(r: Routing) -> list[float]:
     A, E = r.gates.shape
     share = r.gates.sum(0) / max(A, 1) if r.chosen is None else torch.bincount(r.chosen.reshape(-1), minlength=E) / max(r.chosen.numel(), 1)
     return [round(float(c), 4) for c in share]
+
+
+def without_graph(value: Any) -> Any:
+    """Return the same value with every tensor detached, so that the buffers of the autograd graph
+    can be freed."""
+    if isinstance(value, Tensor):
+        return value.detach()
+    if isinstance(value, (tuple, list)):
+        return type(value)(without_graph(item) for item in value)
+    if isinstance(value, dict):
+        return {name: without_graph(item) for name, item in value.items()}
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{f.name: without_graph(getattr(value, f.name)) for f in fields(value) if f.init})
+    return value

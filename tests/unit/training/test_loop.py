@@ -22,7 +22,8 @@ from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Densified, Finished, Previewed, Saved, Started, Stepped, Stopped
 from scene_experts.training.init_from import start_from
 from scene_experts.training.job import Job
-from scene_experts.training.loop import iterate, without_graph
+from scene_experts.training.loop import iterate
+from scene_experts.training.measure import without_graph
 from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training
 from support.captures import load
