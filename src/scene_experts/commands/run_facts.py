@@ -88,9 +88,9 @@ def find_file_facts(path: Path) -> dict[str, str]:
 
 
 def _describe_format(source: Path) -> str:
-    """The name of a file's format, "anchors" for a result folder, and the bytes with all that belongs to
+    """The name of a file's format, or that it is a result folder, and the bytes with all that belongs to
     it."""
-    name, format = ("anchors", None) if source.is_dir() else recognise(source)
+    name, format = ("result folder", None) if source.is_dir() else recognise(source)
     beside = source if source.is_dir() else source.parent if source.name in DESCRIPTIONS else None
     if beside is not None:
         size = sum(file.stat().st_size for file in beside.rglob("*") if file.is_file())
