@@ -17,8 +17,7 @@ from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.numbers import number
 from scene_experts.core.version import __version__
 from scene_experts.render import choose, gsplat_install
-from scene_experts.training.course import GROWN, Course
-from scene_experts.training.course import PER_MEGAPIXEL as SEEN
+from scene_experts.training.course import GROWN, Course, cost_of
 from scene_experts.training.early import LEAST
 
 LIMIT = 8.0  # minutes, so that a capture of few photographs, its training, scores and page take a quarter of an hour together
@@ -106,7 +105,7 @@ def cost_at(pixels: float) -> float:
 def share_of_half(pixels: float) -> float:
     """Return how many times longer a training takes that sees its photographs of so many megapixels at
     half their size in the first half."""
-    slower = (1 + SEEN * pixels) / (1 + SEEN * pixels / 4)
+    slower = cost_of(pixels) / cost_of(pixels / 4)
     half, whole = Course(2, GROWN, 1, slower), Course(2, GROWN)
     return half.spent(2) / slower / whole.spent(2)
 

@@ -52,13 +52,14 @@ def find_course(cfg: Train, cameras: Sequence[PictureSize], cuda: bool | None = 
     """
     if torch.cuda.is_available() if cuda is None else cuda:
         return Course(cfg.iterations)
-    whole = sum(cost_of(camera) for camera in cameras)
-    at_first = sum(cost_of(camera, 2 if is_shrunk(camera) else 1) for camera in cameras)
+    sizes = [(camera.width * camera.height / 1e6, is_shrunk(camera)) for camera in cameras]
+    whole = sum(cost_of(pixels) for pixels, _ in sizes)
+    at_first = sum(cost_of(pixels / 4 if small else pixels) for pixels, small in sizes)
     slower = whole / at_first if cameras and cfg.half_until else 1.0
     return Course(cfg.iterations, GROWN, cfg.half_until, slower)
 
 
-def cost_of(camera: PictureSize, by: int = 1) -> float:
-    """Return what an iteration with a photograph of this camera costs on a CPU, relative to one that
-    draws no pixel. by: How many times smaller the photograph is seen."""
-    return 1 + PER_MEGAPIXEL * camera.width * camera.height / by**2 / 1e6
+def cost_of(pixels: float) -> float:
+    """Return what an iteration with so many megapixels costs on a CPU, relative to one that draws no
+    pixel."""
+    return 1 + PER_MEGAPIXEL * pixels
