@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
@@ -20,6 +21,7 @@ from scene_experts.core.fields import flag_of
 from scene_experts.core.io import read_json, write_json
 from scene_experts.core.progress import Progress
 from scene_experts.core.signals import handled
+from scene_experts.data.capture import name_capture
 from scene_experts.data.match import EXTENSIONS
 from scene_experts.data.prepare import FEW
 from scene_experts.data.readers import is_capture
@@ -28,16 +30,17 @@ from scene_experts.files.options import Options
 from scene_experts.making.budget import LOOK, PAGE_GUESS, TRAINING, TimeBudget, Whole, guess_scores
 from scene_experts.making.plan import TrainingPlan, prepare, too_few
 from scene_experts.sfm.copies import leave_copies_out
+from scene_experts.sfm.folders import SOURCE, list_files
 from scene_experts.sfm.lacking import explain_lacking
 from scene_experts.sfm.options import SfmOptions, SourceOptions
 from scene_experts.sfm.panoramas import cuts
-from scene_experts.sfm.photos import HEIC, find_photos, list_files
+from scene_experts.sfm.photos import HEIC, find_photos
 from scene_experts.sfm.reconstruct import NOTE, check_request, reconstruct
 from scene_experts.training import run_folder
 from scene_experts.training.events import Event, Started, Stepped
 from scene_experts.training.recipes import PROPOSED
 
-CAPTURE, RUN, PAGE, SOURCE = "capture", "run", "scene.html", "source.json"
+CAPTURE, RUN, PAGE = "capture", "run", "scene.html"
 PLAIN = SourceOptions()
 SAVE_EVERY = 1000  # iterations that a killed training loses at most
 RECENT = 200  # iterations whose time counts as that of one at the end
@@ -96,7 +99,7 @@ def make(
     if minutes is not None and not minutes > 0:
         raise InputError(f"expected minutes above 0, found {minutes}; give for example 10")
     budget, source = TimeBudget(None if minutes is None else 60 * minutes), Path(source)
-    folder = Path(out) if out is not None else Path(f"{source.resolve().stem}-scene")
+    folder = Path(out) if out is not None else Path(f"{name_source(source)}-scene")
     took: dict[str, float] = {}
     show, began = Whole(progress), monotonic()
     show.later, show.least = (PAGE_GUESS + 60 * LIMIT if minutes is None else PAGE_GUESS), lambda: budget.left or 0.0
@@ -116,9 +119,16 @@ def make(
         report = run.report()
     took["scores"] = monotonic() - began
     began = monotonic()
-    page = write_page(folder, Options(measure=False, title=source.resolve().stem), show)
+    page = write_page(folder, Options(measure=False, title=name_source(source)), show)
     took["page"] = monotonic() - began
     return MadeScene(page, folder / RUN, place, report, psnr, took)
+
+
+def name_source(source: Path) -> str:
+    """Return what a scene of photographs, a video or a capture is called."""
+    if source.is_dir():  # a date may have dots
+        return name_capture(source) if is_capture(source) else source.resolve().name
+    return source.resolve().stem
 
 
 def check_enough(source: Path, folder: Path, options: SourceOptions) -> None:
@@ -169,7 +179,7 @@ def find_poses(source: Path, folder: Path, options: SourceOptions, say: Callable
         forget_empty(folder, place, note)
         raise
     say(f"poses: {found['with_pose']} of {found['photographs']} photographs, {found['points']:,} points")
-    for line in explain_lacking(found, f"--matching exhaustive --out {folder}-2"):
+    for line in explain_lacking(found, f"--matching exhaustive --out {shlex.quote(f'{folder}-2')}"):
         say(line)
     return place
 

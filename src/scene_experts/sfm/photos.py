@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -24,6 +25,7 @@ from scene_experts.data.colour import White, find_white, is_deep, lift, to_8_bit
 from scene_experts.data.equirectangular import is_seamless
 from scene_experts.data.masks import Found, Mask, find_masks, may_be_mask, read_mask
 from scene_experts.data.match import EXTENSIONS
+from scene_experts.sfm.folders import list_files, tell_written
 
 FEWEST = 3  # photographs needed for a reconstruction
 UNSUPPORTED = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".hdr")  # photographs that Pillow does not read
@@ -67,8 +69,8 @@ class Photo:
 
 
 def find_photos(folder: Path, exclude: Path | None = None, say: Callable[[str], None] = lambda _: None) -> list[Photo]:
-    """Return the photographs in `folder` and its subfolders except `exclude`, sorted so that
-    "2.jpg" precedes "10.jpg".
+    """Return the photographs in `folder` and its subfolders except `exclude` and folders with results
+    (`folders.holds_results`), sorted so that "2.jpg" precedes "10.jpg".
 
     Every photograph is decoded at an eighth of its size to verify it. A HEIC file beside a
     photograph of the same name is left out, and so are masks (`data.masks`).
@@ -78,7 +80,8 @@ def find_photos(folder: Path, exclude: Path | None = None, say: Callable[[str], 
     Raises InputError if there are too few, if some are damaged or a name cannot be used, or if HEIC
     files cannot be read.
     """
-    files = list_files(folder, exclude)
+    written = list[Path]()
+    files = list_files(folder, exclude, written)
     paths = [path for path in files if path.suffix.lower() in EXTENSIONS]
     paths += find_heic(files, {path.with_suffix("") for path in paths}, folder)
     every = {path.relative_to(folder).as_posix(): path for path in paths}
@@ -90,6 +93,8 @@ def find_photos(folder: Path, exclude: Path | None = None, say: Callable[[str], 
         raise InputError(f"expected at least {FEWEST} photographs ({', '.join(EXTENSIONS)}) in {folder}, found {len(names)}; {advice}")
     for line in describe_rest(found, names, sorted(set(files) - set(paths)), folder):
         say(line)
+    if written:
+        say(tell_written(written, folder))
     photos = decide_round(inspect_photos(folder, names, found))
     white, notes = find_white([(folder / photo.name, photo.mode) for photo in photos])
     for line in notes:
@@ -170,21 +175,6 @@ def find_heic(files: Sequence[Path], others: set[Path], folder: Path) -> list[Pa
     return found
 
 
-def list_files(folder: Path, exclude: Path | None) -> list[Path]:
-    """Return the files in `folder` and its subfolders except hidden ones and `exclude`. Symbolic
-    links are followed."""
-    out, seen = [], set()
-    for place, folders, files in os.walk(folder, followlinks=True):
-        here = Path(place).resolve()
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        if here in seen or (exclude is not None and here == exclude.resolve() and here != folder.resolve()):
-            folders.clear()
-            continue
-        seen.add(here)
-        out += [path for name in files if not name.startswith(".") and (path := Path(place) / name).is_file()]
-    return out
-
-
 def natural_key(name: str) -> list[tuple[int, str]]:
     """Return a sort key that orders the numbers in names by value."""
     return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in re.split(r"(\d+)", name)]
@@ -256,14 +246,17 @@ def copy_photos(photos: Sequence[Photo], source: Path, target: Path, keep: Colle
     note = target.with_name(COPIED)
     kept: dict[str, list[float]] = read_json(note, "list of copies") if note.is_file() else {}
     wanted = {photo.stored: photo for photo in photos}
-    masks = {photo.stored: target / f"{PurePosixPath(photo.stored).with_suffix('')}_mask.png" for photo in photos if photo.mask}
+    stems = Counter(PurePosixPath(photo.stored).with_suffix("") for photo in photos)
+    bare = {photo.stored: stem if stems[stem := PurePosixPath(photo.stored).with_suffix("")] == 1 else photo.stored for photo in photos}
+    masks = {photo.stored: target / f"{bare[photo.stored]}_mask.png" for photo in photos if photo.mask}
     for path in [path for path in target.rglob("*") if path.is_file()]:
         name = path.relative_to(target)
         if name.as_posix() not in wanted and path not in masks.values() and name.parts[0] not in keep:
             path.unlink()
     for name, photo in wanted.items():
         new = target / name
-        if not new.is_file() or tuple(kept.get(name, ())) != photo.stamp:
+        whole = new.is_file() and (name not in masks or masks[name].is_file())
+        if not whole or tuple(kept.get(name, ())) != photo.stamp:
             transfer(source / photo.name, new, photo.orientation, photo.suffix, photo.white)
             if photo.mask:
                 copy_mask(photo, masks[name])

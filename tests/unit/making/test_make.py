@@ -13,7 +13,7 @@ from scene_experts.bench.advice import Advice
 from scene_experts.core.errors import InputError
 from scene_experts.making import budget, plan
 from scene_experts.making import make as making
-from scene_experts.making.make import make
+from scene_experts.making.make import make, name_source
 from scene_experts.sfm.options import SfmOptions, SourceOptions
 from scene_experts.training.events import Stepped
 from scene_experts.training.recipes import PROPOSED
@@ -278,3 +278,12 @@ def test_a_real_page_is_made_within_its_time(capture, tmp_path):
     assert made.page.stat().st_size > 100_000 and made.psnr > 15
     again = make(capture, tmp_path / "out", minutes=0.5, say=lambda _: None)
     assert again.page == made.page and again.seconds["page"] < 1
+
+
+def test_a_scene_is_named_after_its_source(tmp_path, capture):
+    (tmp_path / "2024.05.12").mkdir()
+    (tmp_path / "walk.mp4").touch()
+    assert [name_source(tmp_path / name) for name in ("2024.05.12", "walk.mp4")] == ["2024.05.12", "walk"]
+    (tmp_path / "attic").mkdir()
+    (tmp_path / "attic" / "capture").symlink_to(capture)
+    assert name_source(capture) == capture.name

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from scene_experts.core.errors import InputError
+from scene_experts.data.masks import find_masks
 from scene_experts.sfm.photos import Photo, check_in_place, copy_photos, decide_round, find_photos, group_by_camera
 from support.messages import naming
 from support.photos import write_photo, write_turned
@@ -226,3 +227,18 @@ def test_photographs_of_one_camera_are_all_panoramas_or_none():
     photos = [Photo(str(i), (20, 10), ("A",), round=i < 2) for i in range(4)] + [Photo("4", (20, 10), ("B",), round=False)]
     assert [photo.round for photo in decide_round(photos)] == [True] * 4 + [False]
     assert not any(photo.round for photo in decide_round([Photo(str(i), (20, 10), round=i < 1) for i in range(3)]))
+
+
+def test_photographs_that_differ_in_extension_only_have_masks_of_their_own(tmp_path):
+    source, target = tmp_path / "photos", tmp_path / "work" / "images"
+    for name, level in (("1.jpg", 0), ("1.png", 255), ("2.jpg", 255)):
+        write_photo(source / name)
+        (source / "masks").mkdir(exist_ok=True)
+        Image.new("L", (40, 30), level).save(source / "masks" / f"{name}.png")
+    photos = find_photos(source)
+    found = copy_photos(photos, source, target)
+    there = find_masks({photo.name: target / photo.name for photo in found}, [target]).masks
+    assert {name: np.asarray(Image.open(mask.path)).max() for name, mask in there.items()} == {"1.jpg": 0, "1.png": 255, "2.jpg": 255}
+    assert there["2.jpg"].path.name == "2_mask.png"
+    there["1.jpg"].path.unlink()  # copied again, though the photograph is there
+    assert copy_photos(photos, source, target)[0].mask.path.is_file()
