@@ -9,8 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypedDict, Unpack
 
-from rich.console import Console
-
 from scene_experts.api import checked, recording
 from scene_experts.api.backend import Device, Raster, device_of
 from scene_experts.api.backend import deterministic as deterministic_algorithms
@@ -18,6 +16,7 @@ from scene_experts.api.capture import Capture, load_capture
 from scene_experts.api.command_line import command_of
 from scene_experts.api.recipe import Recipe, recipe
 from scene_experts.api.run import Run
+from scene_experts.core.console import LastingConsole
 from scene_experts.core.errors import InputError
 from scene_experts.render import choose
 from scene_experts.training import run_folder
@@ -225,7 +224,7 @@ def train(
             f"numbers of the recipe are given to it: train(recipe(..., {unknown[0]}=...), ...)"
         )
     trainer = Trainer(method, capture, out, **settings)
-    console = Console(markup=False, highlight=False, quiet=not progress)
+    console = LastingConsole(markup=False, highlight=False, quiet=not progress)
     with saved_on_interrupt(trainer, out is not None), TrainingProgress(console, out=Path(out) if out is not None else None) as show:
         for event in trainer:
             show(event)

@@ -36,14 +36,13 @@ class CaptureCommand:
 def capture(args: list[str]) -> int:
     command = parse(CaptureCommand, Command(f"{PROG} capture", ("photos",)), args)
 
-    from rich.console import Console
-
     from scene_experts.commands.next_step import propose_training
+    from scene_experts.core.console import LastingConsole
     from scene_experts.data.settings import Data
     from scene_experts.sfm.reconstruct import reconstruct
     from scene_experts.training.progress import ProgressBar
 
-    console = Console(markup=False, highlight=False)
+    console = LastingConsole(markup=False, highlight=False)
     say = lambda text: console.print(text, soft_wrap=True, markup=False)  # noqa: E731
     with handled(interrupt), ProgressBar(console) as bar:
         note = reconstruct(command.photos, command.out, command.options, overwrite=command.overwrite, say=say, progress=bar)

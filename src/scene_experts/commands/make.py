@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -46,13 +47,12 @@ def make(args: list[str]) -> int:
 
     from webbrowser import open_new_tab
 
-    from rich.console import Console
-
     from scene_experts.commands.capture import interrupt
+    from scene_experts.core.console import LastingConsole
     from scene_experts.making.make import make as run
     from scene_experts.training.progress import ProgressBar, format_duration
 
-    console = Console(markup=False, highlight=False)
+    console = LastingConsole(markup=False, highlight=False)
     say = lambda text: console.print(text, soft_wrap=True, markup=False)  # noqa: E731
     with handled(interrupt), ProgressBar(console) as bar:
         made = run(
@@ -77,7 +77,8 @@ def make(args: list[str]) -> int:
         say(f"report: {made.report}")
     size = made.page.stat().st_size / 1e6
     say(f"open {made.page} in a browser ({size:.1f} MB, one file to share)")
-    say(f"next: scene-experts export {made.run} --format sog --out scene.sog  # other files, of the run in {made.run}")
+    export = shlex.join([PROG, "export", str(made.run), "--format", "sog", "--out", "scene.sog"])
+    say(f"next: {export}  # other files, of the run in {made.run}")
     if command.open:
         open_new_tab(made.page.resolve().as_uri())
     return 0

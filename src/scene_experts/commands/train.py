@@ -19,6 +19,7 @@ from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import HELP, HELP_ALL, Command, HelpAsked, parse
 from scene_experts.arguments.table import rows
 from scene_experts.commands import PROG
+from scene_experts.core.console import LastingConsole
 from scene_experts.core.errors import InputError, few, nearest
 from scene_experts.core.group import Alone, join
 from scene_experts.core.signals import handled
@@ -107,7 +108,7 @@ def train(args: list[str]) -> int:
     command = after_restart(replace(command, viewer=command.viewer and group.first), group)
     line = shlex.join([PROG, "train", *(arg for arg in args if arg != "--resume")])  # the command of the whole run
     command, run, capture, rasterize = group.agree(lambda: prepare(command, line, group))
-    console = Console(markup=False, highlight=False, quiet=not group.first)
+    console = LastingConsole(markup=False, highlight=False, quiet=not group.first)
     steady = warn_of_steady(capture.root) if command.cfg.exposure else None
     for warning in (*capture.warnings, *([steady] if steady else [])) if group.first else ():
         print(f"warning: {warning}", file=sys.stderr)
