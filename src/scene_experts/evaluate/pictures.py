@@ -16,7 +16,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from scene_experts.core.io import write_atomic
+from scene_experts.core.io import locked, write_atomic
 from scene_experts.core.reading.budget import PICTURE
 from scene_experts.core.reading.pictures import opening_picture
 from scene_experts.native.library import count_cores
@@ -65,20 +65,24 @@ def replacing(folder: Path, first: bool = True) -> Iterator[Path]:
 
     After an error the pictures in `folder` are unchanged and the new ones are removed.
     first: Whether this process owns the folder; others only write into it.
+
+    Raises InputError if another evaluation writes beside `folder`.
     """
     new = folder.with_name(f".{folder.name}.part")
-    if first:
-        shutil.rmtree(new, ignore_errors=True)
-    try:
+    if not first:
         yield new
-        if first:
+        return
+    new.parent.mkdir(parents=True, exist_ok=True)
+    with locked(new.with_name(".eval.lock"), f"another evaluation writes to {folder.parent}; wait until it ends"):
+        shutil.rmtree(new, ignore_errors=True)
+        try:
+            yield new
             remove_pictures(folder)
             folder.mkdir(parents=True, exist_ok=True)
             for name in PICTURES:
                 if (new / name).is_dir():
                     os.replace(new / name, folder / name)
-    finally:
-        if first:
+        finally:
             shutil.rmtree(new, ignore_errors=True)
 
 

@@ -11,6 +11,7 @@ import torch
 
 from scene_experts.core.errors import InputError, RunError
 from scene_experts.evaluate import pictures
+from support.messages import naming
 
 
 def test_rounding_is_that_of_the_protocol() -> None:
@@ -83,10 +84,16 @@ def test_new_pictures_replace_old_ones_when_all_are_written(tmp_path: Path) -> N
     with pytest.raises(ZeroDivisionError), pictures.replacing(tmp_path / "test") as new:
         pictures.write_picture(new / "renders" / "new.png", np.zeros((2, 2), np.uint8))
         raise ZeroDivisionError
-    assert old.is_file() and [p.name for p in tmp_path.iterdir()] == ["test"]
+    assert old.is_file() and [p.name for p in tmp_path.iterdir() if p.is_dir()] == ["test"]
     with pictures.replacing(tmp_path / "test") as new:
         pictures.write_picture(new / "renders" / "new.png", np.zeros((2, 2), np.uint8))
-    assert [p.name for p in (tmp_path / "test" / "renders").iterdir()] == ["new.png"] and [p.name for p in tmp_path.iterdir()] == ["test"]
+    assert [p.name for p in (tmp_path / "test" / "renders").iterdir()] == ["new.png"]
+    assert [p.name for p in tmp_path.iterdir() if p.is_dir()] == ["test"]
+
+
+def test_two_evaluations_of_one_run_do_not_write_into_each_other(tmp_path: Path) -> None:
+    with pictures.replacing(tmp_path / "test"), pytest.raises(InputError, match=naming(tmp_path)), pictures.replacing(tmp_path / "test"):
+        pass
 
 
 def test_joined_pictures_have_a_white_gap():
