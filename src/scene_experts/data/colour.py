@@ -146,7 +146,7 @@ def to_8_bit(image: Image.Image, white: White | None = None) -> Image.Image:
             out[top : top + 256] = np.clip(np.rint(strip * scale), 0, 255)
         return Image.fromarray(out)
     image = to_srgb(image)
-    if image.mode in ("L", "RGB", "RGBA"):
+    if image.mode in ("L", "RGB", "RGBA") and "transparency" not in image.info:
         return image
     return image.convert("RGBA" if "transparency" in image.info or image.mode in ("LA", "PA", "La", "RGBa") else "RGB")
 

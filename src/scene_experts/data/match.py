@@ -85,9 +85,16 @@ def match_images(folder: Path, names: Sequence[str]) -> Match:
 
 def list_pictures(folder: Path, deep: bool = True) -> list[str]:
     """Return the paths of the pictures in `folder`, and if `deep` in its subfolders, relative to it
-    with "/" between folders, sorted; empty if there is no such folder."""
-    top, out = str(folder), []
-    for place, folders, files in os.walk(top):
+    with "/" between folders, sorted; empty if there is no such folder. Symbolic links are
+    followed."""
+    top, out, seen = str(folder), [], set()
+    for place, folders, files in os.walk(top, followlinks=deep):
+        if folders or seen:  # links may lead back
+            real = os.path.realpath(place)
+            if real in seen:
+                folders.clear()
+                continue
+            seen.add(real)
         inner = place[len(top) :].replace(os.sep, "/").strip("/")
         out += [f"{inner}/{name}" if inner else name for name in files if is_picture(name)]
         if not deep:

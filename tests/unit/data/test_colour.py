@@ -184,3 +184,12 @@ def test_colours_of_16_bits_that_fill_a_part_of_their_range(made: Synthetic, for
         frame = capture.frame(i)
         assert np.abs(frame.rgb.numpy().astype(int) - rgb).max() <= 1 and frame.mask is None
     assert (told in str(capture.warnings)) and ("16-bit colours" in str(capture.warnings)) == bool(told)
+
+
+@pytest.mark.parametrize(("mode", "clear"), [("RGB", (255, 0, 255)), ("L", 7)])
+def test_a_transparent_colour_is_transparent(mode: str, clear: object, tmp_path: Path) -> None:
+    picture = Image.new(mode, (2, 1), clear)
+    picture.putpixel((1, 0), 9 if mode == "L" else (1, 2, 3))
+    picture.save(tmp_path / "x.png", transparency=clear)
+    with Image.open(tmp_path / "x.png") as found:
+        assert np.asarray(to_8_bit(found))[0, :, 3].tolist() == [0, 255]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from scene_experts.data.match import NameIndex, absent_error, find_file, match_images, to_relative_name
+from scene_experts.data.match import NameIndex, absent_error, find_file, list_pictures, match_images, to_relative_name
 
 
 def touch(root: Path, *names: str) -> None:
@@ -100,3 +100,11 @@ def test_an_absent_image_is_reported(tmp_path: Path) -> None:
     assert match.absent == ("a.jpg",)
     text = str(absent_error(tmp_path, ["a.jpg", "b.jpg"], match.absent))
     assert "2" in text and "a.jpg" in text and "--images" in text
+
+
+def test_pictures_behind_links_are_listed_once(tmp_path: Path) -> None:
+    touch(tmp_path, "elsewhere/1.png", "masks/2.png")
+    (tmp_path / "masks" / "cam1").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere" / "loop").symlink_to(tmp_path / "masks")
+    assert list_pictures(tmp_path / "masks") == ["2.png", "cam1/1.png"]
+    assert list_pictures(tmp_path / "masks", deep=False) == ["2.png"]
