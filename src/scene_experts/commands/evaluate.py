@@ -61,10 +61,10 @@ def evaluate(args: list[str]) -> int:
             print(f"warning: {line}")
         print(f"wrote {page.write([command.run])}, with the pictures and what each score means")
     if command.options == EvalOptions():
-        place = str(command.run / "scene.html")
-        words = [PROG, "export", str(command.run), "--format", "html", "--title", results["capture"], "--out", place]
+        place, moved = str(command.run / "scene.html"), ["--data", str(command.data)] if command.data else []
+        words = [PROG, "export", str(command.run), "--format", "html", "--title", results["capture"], *moved, "--out", place]
         print(f"next: {shlex.join(words)}  # or --format ply")
-        print(f"next: {shlex.join([PROG, 'render', str(command.run), '--out', str(command.run / 'flight.mp4')])}")
+        print(f"next: {shlex.join([PROG, 'render', str(command.run), *moved, '--out', str(command.run / 'flight.mp4')])}")
     return 0
 
 

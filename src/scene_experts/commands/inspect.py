@@ -26,6 +26,7 @@ def info(args: list[str]) -> int:
     from scene_experts.commands.next_step import propose_training
     from scene_experts.data import capture as captures
     from scene_experts.data.summary import print_summary
+    from scene_experts.data.views import typical_size
     from scene_experts.training import run_folder
 
     console = Console(markup=False, highlight=False)
@@ -39,8 +40,8 @@ def info(args: list[str]) -> int:
         return 0
     capture = captures.load(run_folder.named(data), allow_no_points=True)
     print_summary(capture, console)
-    lens = capture.images.sources[0].lens
-    console.print(propose_training(data, lens.width, lens.height, len(capture.views)), markup=False, soft_wrap=True)
+    width, height = typical_size((source.lens.width, source.lens.height) for source in capture.images.sources)
+    console.print(propose_training(data, width, height, len(capture.views)), markup=False, soft_wrap=True)
     return 0
 
 
@@ -48,7 +49,8 @@ def is_run(folder: Path) -> bool:
     """Whether a folder is a run folder and no capture."""
     from scene_experts.data.readers import is_capture
 
-    return (folder / "config.json").is_file() and (folder / "checkpoints").is_dir() and not is_capture(folder)
+    begun = (folder / "checkpoints").is_dir() or (folder / "metrics.jsonl").is_file()
+    return (folder / "config.json").is_file() and begun and not is_capture(folder)
 
 
 def is_scene(path: Path) -> bool:

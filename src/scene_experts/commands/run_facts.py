@@ -14,6 +14,7 @@ from scene_experts.commands import PROG
 from scene_experts.core.io import read_json
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.numbers import number
+from scene_experts.evaluate.results import results_file
 from scene_experts.files.export import NAME
 from scene_experts.files.lone import open_scene
 from scene_experts.files.registry import DESCRIPTIONS, recognise
@@ -107,21 +108,23 @@ def _extent(positions: Tensor) -> Tensor:
 
 
 def find_scores(run: Path) -> str:
-    """Return the scores of the held-out views; empty if there are none."""
-    if not (run / "results.json").is_file():
+    """Return the scores of the held-out views, or of the training views of a run that holds none out;
+    empty if there are none."""
+    file = results_file(run)
+    if not file.is_file():
         return ""
-    found = read_json(run / "results.json", "results")
+    found = read_json(file, "results")
     try:
         psnr, ssim, step = (number(found[name], name, -1e6, 1e9) for name in ("psnr", "ssim", "step"))  # type: ignore[index]
-        lpips = found.get("lpips")  # type: ignore[union-attr]
+        lpips, views = found.get("lpips"), found.get("views")  # type: ignore[union-attr]
     except (Damaged, LookupError, TypeError):
         return ""
     of_it = "" if lpips is None else f", LPIPS {lpips:.3f}"
-    return f"PSNR {psnr:.2f} dB, SSIM {ssim:.3f}{of_it} (held-out views, iteration {step:,.0f})"
+    return f"PSNR {psnr:.2f} dB, SSIM {ssim:.3f}{of_it} ({'training' if views == 'train' else 'held-out'} views, iteration {step:,.0f})"
 
 
 def propose_next(run: Path) -> str:
     """Return the command that comes next for a trained run."""
-    scored = (run / "results.json").is_file() or run_folder.read_config(run).data.split == "none"
+    scored = results_file(run).is_file() or run_folder.read_config(run).data.split == "none"
     words = ["export", str(run), "--format", "html"] if scored else ["eval", str(run)]
     return shlex.join([PROG, *words])

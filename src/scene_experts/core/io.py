@@ -62,9 +62,9 @@ _PLACE = (
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP)  # of a file system without locks
 
 
-def _unwritable(path: Path, error: OSError, option: str = "--out") -> RunError:
+def _unwritable(path: Path, error: OSError, option: str = "") -> RunError:
     advice = "choose" if error.errno in _PLACE else "free some space or choose"
-    return RunError(f"cannot write {path}: {error.strerror or error}; {advice} another folder with {option}")
+    return RunError(f"cannot write {path}: {error.strerror or error}; {advice} another folder{f' with {option}' if option else ''}")
 
 
 def check_writable(path: Path, option: str = "--out") -> None:

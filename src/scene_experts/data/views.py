@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -21,6 +21,12 @@ Vector = tuple[float, float, float]
 _FLOAT32 = 2.0**-23  # step of float32, relative
 FINEST = 1e-5  # step of float32 that positions may have, relative to the extent
 SAMPLED = 4  # views whose poses identify those of a capture
+
+
+def typical_size(sizes: Iterable[tuple[int, int]]) -> tuple[int, int]:
+    """Return the width and height of median area, px: what most photographs of a mixed capture cost."""
+    ordered = sorted(sizes, key=lambda size: size[0] * size[1])
+    return ordered[len(ordered) // 2]
 
 
 @dataclass(frozen=True)

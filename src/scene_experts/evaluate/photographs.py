@@ -28,6 +28,7 @@ from scene_experts.core.types import Mode
 from scene_experts.data import prepare
 from scene_experts.evaluate import pictures
 from scene_experts.evaluate.metrics import psnr
+from scene_experts.evaluate.results import command_of
 
 if TYPE_CHECKING:
     from scene_experts.data.capture import Capture
@@ -144,7 +145,7 @@ def describe_outliers(found: list[Photograph]) -> list[str]:
 def _read(path: Path) -> dict[str, dict[str, Any]]:
     value = read_json(path, "scores by view") if path.is_file() else {}
     if not isinstance(value, dict) or not all(isinstance(v, dict) and isinstance(v.get("file"), str) for v in value.values()):
-        raise InputError(f"expected scores by view in {path}, found something else; run `scene-experts eval {path.parent}` again")
+        raise InputError(f"expected scores by view in {path}, found something else; run `{command_of(path.parent)}` again")
     with guarding(path, RUN, "file of scores by view"):
         for facts in value.values():
             inside(path.parent, facts["file"])

@@ -3,6 +3,7 @@ runs may be compared."""
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import combinations
@@ -173,13 +174,27 @@ def describe_failed(per_view: dict[str, dict[str, Any]]) -> str:
     )
 
 
-def load_results(run: Path, views: str = "test") -> dict[str, Any]:
-    """Read results.json of a run folder. Raises InputError if the run was not evaluated."""
-    path = run / ("results.json" if views == "test" else f"results_{views}.json")
-    if run.is_file():
-        path = run
+def command_of(run: Path) -> str:
+    """Return the command that scores a run."""
+    return shlex.join(["scene-experts", "eval", str(run)])
+
+
+def results_file(run: Path) -> Path:
+    """Return the place of the results of a run folder: those of its training views if only these were
+    scored, because it holds none out."""
+    held, trained = run / "results.json", run / "results_train.json"
+    return trained if trained.is_file() and not held.is_file() else held
+
+
+def load_results(run: Path, training: bool = False) -> dict[str, Any]:
+    """Read results.json of a run folder, or a file of results. Raises InputError if the run was not
+    evaluated.
+
+    training: Whether those of the training views do for a run that holds none out.
+    """
+    path = run if run.is_file() else results_file(run) if training else run / "results.json"
     if not path.is_file():
-        raise InputError(f"expected an evaluated run with {path.name} in {run}, found none; run `scene-experts eval {run}` first")
+        raise InputError(f"expected an evaluated run with {path.name} in {run}, found none; run `{command_of(run)}` first")
     results = read_json(path, "results file")
     if not isinstance(results, dict) or not isinstance(results.get("psnr"), (int, float)):
         raise InputError(f"expected results of `scene-experts eval` in {path}, found something else; evaluate the run again")
@@ -195,7 +210,7 @@ def find_outdated(names: Sequence[str], runs: Sequence[Path], results: Sequence[
     for name, run, found in zip(names, runs, results):
         newest = max((int(p.stem[5:]) for p in (run / "checkpoints").glob("ckpt_*.safetensors") if p.stem[5:].isdecimal()), default=0)
         if newest > (found.get("step") or newest):
-            out.append(f"{name} was scored at iteration {found['step']:,} and is at {newest:,} now: run `scene-experts eval {run}` again")
+            out.append(f"{name} was scored at iteration {found['step']:,} and is at {newest:,} now: run `{command_of(run)}` again")
     return out
 
 

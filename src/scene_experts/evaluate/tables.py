@@ -227,7 +227,7 @@ def compare_runs(runs: Sequence[Path], format: Format, mixed: bool, console: Con
     if not runs:
         raise InputError("expected at least one run folder, found none; give the folders that `scene-experts train --out` wrote")
     with guarding(runs[0] if len(runs) == 1 else "one of the runs", RUN):  # the files of a run may hold anything
-        results = [load_results(Path(run)) for run in runs]
+        results = [load_results(Path(run), training=True) for run in runs]
         names = name_runs([Path(run) for run in runs], results)
         if not mixed:
             check_protocol(names, results)

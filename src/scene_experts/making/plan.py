@@ -15,6 +15,7 @@ from scene_experts.bench.machine import measure_share
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
 from scene_experts.data.prepare import FEW
+from scene_experts.data.views import typical_size
 from scene_experts.making.budget import LEAST, TimeBudget, find_slowness, plan_training
 from scene_experts.sfm.drift import drifts
 from scene_experts.training import run_folder
@@ -92,8 +93,8 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
     whole = load_capture(place, split=split)
     if scores and not whole.test_cameras:
         raise too_few(len(whole.train_cameras))
-    lens = whole.cameras[0]
-    first = TrainingPlan(place, split, (lens.width, lens.height), whole, recipe(PROPOSED, exposure=drifts(place)))
+    size = typical_size((camera.width, camera.height) for camera in whole.cameras)
+    first = TrainingPlan(place, split, size, whole, recipe(PROPOSED, exposure=drifts(place)))
     share = measure_share(torch.get_num_threads())
     plan = first.fit(budget.for_training(first.held), 1 / share)
     held = f", {len(whole.test_cameras)} held out" if scores else ""

@@ -14,7 +14,7 @@ from scene_experts.core.reading.plain import read_json_lines
 from scene_experts.core.reading.source import guarding, inside
 from scene_experts.data.views import same_poses
 from scene_experts.evaluate.photographs import Photograph, read_photographs
-from scene_experts.evaluate.results import load_results
+from scene_experts.evaluate.results import command_of, load_results, results_file
 from scene_experts.evaluate.tables import distinguish_runs
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
@@ -43,12 +43,12 @@ class ShownRun:
 def read_run(run: Path) -> ShownRun:
     """Read a run folder: the scores of its held-out views, or of its training views if only these
     were scored. Raises InputError if it is not evaluated or its scores by view are invalid."""
-    views = "train" if not (run / "results.json").is_file() and (run / "results_train.json").is_file() else "test"
-    config, results = run_folder.read_config(run), load_results(run, views)
+    config, results = run_folder.read_config(run), load_results(run, training=True)
+    views = "train" if results_file(run).name == "results_train.json" else "test"
     path = run / ("per_view.json" if views == "test" else "per_view_train.json")
     per_view = read_json(path, "scores by view") if path.is_file() else {}
     if not isinstance(per_view, dict) or not all(isinstance(v, dict) and isinstance(v.get("file"), str) for v in per_view.values()):
-        raise InputError(f"expected scores by view in {path}, found something else; run `scene-experts eval {run}` again")
+        raise InputError(f"expected scores by view in {path}, found something else; run `{command_of(run)}` again")
     with guarding(path, RUN, "file of scores by view"):
         for facts in per_view.values():
             inside(run / views / "gt", facts["file"])

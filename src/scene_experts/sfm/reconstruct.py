@@ -23,6 +23,7 @@ from scene_experts.data.equirectangular import find_place
 from scene_experts.data.match import EXTENSIONS
 from scene_experts.data.prepare import STRETCHED
 from scene_experts.data.readers import is_capture
+from scene_experts.data.views import typical_size
 from scene_experts.native import library as native
 from scene_experts.sfm import frames, photos, work
 from scene_experts.sfm.attempts import find_poses, warn_of_mapper
@@ -302,7 +303,7 @@ def describe_result(
         "format": 1,
         "copied": copied,
         "photographs": len(found),
-        "size": list(found[0].size),
+        "size": list(typical_size(photo.size for photo in found)),
         "with_pose": len(registered),
         "without_pose": [photo.name for photo in found if photo.name not in registered],
         "all_compared": exhaustive,

@@ -77,3 +77,7 @@ def test_scores_are_told_with_their_iteration_and_damaged_ones_are_none(tmp_path
     assert propose_next(tmp_path).startswith("scene-experts export")
     write_json(tmp_path / "results.json", {"psnr": "high"})
     assert find_scores(tmp_path) == ""
+    (tmp_path / "results.json").unlink()
+    write_json(tmp_path / "results_train.json", {"psnr": 33.0, "ssim": 0.9, "step": 100, "views": "train"})
+    assert find_scores(tmp_path) == "PSNR 33.00 dB, SSIM 0.900 (training views, iteration 100)"
+    assert propose_next(tmp_path).startswith("scene-experts export")

@@ -47,7 +47,7 @@ def test_a_failed_write_is_a_run_error_and_leaves_the_old_file(tmp_path, error):
         temporary.write_text("half")
         raise error
 
-    with pytest.raises(RunError, match=naming(path, "--out")):
+    with pytest.raises(RunError, match=naming(path, "another folder")):
         write_atomic(path, write)
     assert path.read_text() == "old" and names(tmp_path) == ["x"]
 
@@ -72,7 +72,7 @@ def test_a_full_disk(tmp_path):
 
 def test_a_folder_that_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(RunError, match="--out"):
+    with pytest.raises(RunError, match="another folder"):
         write_bytes(tmp_path / "file" / "x", b"")
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from scene_experts.core.types import Camera
-from scene_experts.data.views import World, same_poses
+from scene_experts.data.views import World, same_poses, typical_size
 from support.captures import load
 from support.synthetic import look_at, make_capture
 
@@ -97,3 +97,8 @@ def test_other_cameras_leave_the_poses_by_which_a_capture_is_known(tmp_path):
     moved = capture.with_cameras(lambda c: replace(c, world_to_cam=c.world_to_cam + 1))
     assert torch.equal(moved.views[1].camera.world_to_cam, capture.views[1].camera.world_to_cam + 1)
     assert moved.poses() == capture.poses() == moved.with_cameras(lambda c: c).poses()
+
+
+def test_the_typical_size_is_that_of_most_photographs():
+    assert typical_size([(300, 199), (1200, 797), (797, 1200), (1200, 797)]) in [(1200, 797), (797, 1200)]
+    assert typical_size([(4, 3)]) == (4, 3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.io import write_json
 from scene_experts.evaluate.metrics import Perceptual
 from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.results import (
@@ -16,6 +17,7 @@ from scene_experts.evaluate.results import (
     find_difference,
     find_failed,
     find_outdated,
+    load_results,
 )
 from support.captures import load
 from support.messages import naming
@@ -107,3 +109,16 @@ def test_views_that_fail_are_named():
     assert "1 of 4" in text and "b (8.0 dB)" in text and "20.0 dB" in text
     assert describe_failed({name: views[name] for name in "acd"}) == ""
     assert find_failed({name: views[name] for name in "ab"}) == ["b"]  # also of two views
+
+
+def test_a_run_that_holds_nothing_out_has_the_scores_of_its_training_views_where_they_do(tmp_path):
+    run = tmp_path / "my run"
+    run.mkdir()
+    with pytest.raises(InputError, match="'"):  # the command is quoted
+        load_results(run)
+    write_json(run / "results_train.json", {"psnr": 33.0, "step": 100})
+    assert load_results(run, training=True)["psnr"] == 33.0
+    with pytest.raises(InputError):  # not those of held-out views
+        load_results(run)
+    write_json(run / "results.json", {"psnr": 27.0, "step": 100})
+    assert load_results(run, training=True)["psnr"] == 27.0

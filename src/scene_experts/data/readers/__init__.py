@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import shlex
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -120,10 +121,8 @@ def unrecognised_error(folder: Path) -> InputError:
     for place in (folder, folder / "images"):
         photos = sum(p.suffix.lower() in EXTENSIONS for p in place.iterdir()) if place.is_dir() else 0
         if photos:
-            out = "CAPTURE" if place == folder else str(folder)
-            return InputError(
-                f"expected camera poses in {folder}, found only {photos} photographs; run `scene-experts capture {place} --out {out}`"
-            )
+            words = ["scene-experts", "capture", str(place), "--out", "CAPTURE" if place == folder else str(folder)]
+            return InputError(f"expected camera poses in {folder}, found only {photos} photographs; run `{shlex.join(words)}`")
     if (folder / ".capture").is_dir():
-        return InputError(f"{expected} an unfinished one; run its `scene-experts capture PHOTOS --out {folder}` again")
+        return InputError(f"{expected} an unfinished one; run its `scene-experts capture PHOTOS --out {shlex.quote(str(folder))}` again")
     return InputError(f"{expected} none of these; give the folder that contains them")
