@@ -21,14 +21,18 @@ def with_near_plane(config: RunConfig, capture: Capture) -> tuple[RunConfig, Cap
     """Return the configuration and the capture with the near plane that the recipe asks for.
 
     It lies at `train.near_share` of the least depth that photographs show, never nearer than the
-    default. `data.near` has the last word. A capture without points of its own keeps the default.
+    default. `data.near` has the last word, also for a capture that was loaded without it. A capture
+    without points of its own keeps the default.
     """
     share, near = config.train.near_share, config.data.near
-    if near is not None or share == 0 or (nearest := find_nearest(capture)) is None:
-        return config, capture
-    near = float(f"{share * nearest:.3g}")  # the same on all processors
-    if near <= max(view.camera.near for view in capture.views):
-        return config, capture
+    if near is None:
+        if share == 0 or (nearest := find_nearest(capture)) is None:
+            return config, capture
+        near = float(f"{share * nearest:.3g}")  # the same on all processors
+        if near <= max(view.camera.near for view in capture.views):
+            return config, capture
+    if all(view.camera.near == near for view in capture.views):
+        return replace(config, data=replace(config.data, near=near)), capture
     views = tuple(replace(view, camera=replace(view.camera, near=near)) for view in capture.views)
     return replace(config, data=replace(config.data, near=near)), replace(capture, views=views)
 

@@ -181,3 +181,12 @@ def test_the_arguments_are_those_of_the_options():
         differ = {name for name in found.keys() - own if found[name].default != fields[name]}
         assert differ <= {"normalise"}  # None: that of the scene of the catalog, or the default of `Data`
     assert TrainOptions.__dataclass_fields__.keys() == Settings.__annotations__.keys()
+
+
+def test_opening_a_run_while_another_trains_changes_no_bit(capture, small, run, tmp_path):
+    for name, looks in (("alone", False), ("watched", True)):
+        for event in se.Trainer(small, capture, tmp_path / name, deterministic=True, device="cpu"):
+            if looks and isinstance(event, se.Stepped):
+                se.open_run(run.path)
+    ours, theirs = tensors(tmp_path / "alone"), tensors(tmp_path / "watched")
+    assert [name for name in ours if not torch.equal(ours[name], theirs[name])] == []

@@ -54,8 +54,10 @@ def test_it_is_a_share_of_the_least_depth_that_training_views_show(folder):
 
 def test_what_is_named_or_too_near_or_unknown_keeps_its_near_plane(folder):
     capture = load(folder)
-    for config in (setting(folder, share=0.0), setting(folder, near=0.3), setting(folder, share=1e-3)):
+    for config in (setting(folder, share=0.0), setting(folder, share=1e-3)):
         assert with_near_plane(config, capture) == (config, capture)
+    config, named = with_near_plane(setting(folder, near=0.3), capture)
+    assert config == setting(folder, near=0.3) and {view.camera.near for view in named.views} == {0.3}
     few = Points(capture.points.xyz[:5], capture.points.rgb[:5])
     for other in (replace(capture, random_points=True), replace(capture, points=None), replace(capture, points=few)):
         assert find_nearest(other) is None
@@ -84,3 +86,13 @@ def test_the_api_does_the_same(folder):
     trainer = se.Trainer(se.recipe("one-network", iterations=20), folder)
     nears = {view.camera.near for view in trainer.capture.loaded.views}
     assert nears == {trainer.capture.data.near} and np.isfinite(trainer.capture.data.near)
+    assert nears != {view.camera.near for view in se.load_capture(folder).loaded.views}
+
+
+def test_the_api_resumes_with_the_near_plane_that_the_run_began_with(folder, tmp_path):
+    method = se.recipe("one-network", iterations=20)
+    begun = se.Trainer(method, folder, tmp_path / "run", device="cpu", stop_at=10)
+    begun.finish()
+    resumed = se.Trainer(method, folder, tmp_path / "run", device="cpu", resume=True)
+    near = begun.capture.data.near
+    assert resumed.capture.data.near == near and {view.camera.near for view in resumed.capture.loaded.views} == {near}
