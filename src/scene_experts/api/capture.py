@@ -236,8 +236,9 @@ def load_capture(
         resolution: "as-is", "factor:N" (divide by N), "longest:PX" (longest side), "cap1600" (at
             most 1600 px wide), "share:S" (share of the size that cap1600 gives), "inria:N" (the
             folder images_N), or "auto": the paper's for a scene of the catalog, else cap1600.
-        split: Which views are held out: "mod8" (every 8th), "modN", "first:N", "none", "files" (as
-            the files of the capture state), or "auto": "files" if they state it, else "mod8".
+        split: Which views are held out: "mod8" (every 8th), "mod:N", "fold:K/N" (every Nth from the
+            Kth), "first:N", "none", "files" (as the files of the capture state), or "auto": "files" if
+            they state it, "none" with fewer than 12 views, else "mod8".
         leave_out: Names of photographs that are neither trained on nor held out, for example
             ["DSC_0423.JPG"]. Folder and extension may be omitted where a name stays unambiguous.
         missing: "drop" leaves out views without a photograph instead of raising InputError.

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from scene_experts.api import recording
+from scene_experts.api import checked, recording
 from scene_experts.api.backend import Device, Raster, backend
 from scene_experts.api.camera import Camera, to_trained
 from scene_experts.api.capture import Capture, load_capture
@@ -279,15 +279,15 @@ class Run:
 
         Args:
             format: "compact" is one small file of this package, "html" a web page with it that decodes
-                its networks. "anchors" is the Scaffold-GS folder layout. "ply", "compressed-ply",
-                "splat", "spz", "sog", "glb", "usd" and "baked-html" (a page with a viewer) are
-                standard files of Gaussians; scenes of anchors are baked for them, which takes
-                minutes. "html" of other scenes is that page. "mesh" is a PLY or GLB file of coloured
-                triangles.
+                its networks, and "streamed-html" such a page that fetches it in parts. "anchors" is
+                the Scaffold-GS folder layout. "ply", "compressed-ply", "splat", "spz", "sog", "glb",
+                "usd" and "baked-html" (a page with a viewer) are standard files of Gaussians; scenes
+                of anchors are baked for them, which takes minutes. "html" of other scenes is that
+                page. "mesh" is a PLY or GLB file of coloured triangles.
             out: File or folder; a name without a suffix is a folder. Default: inside the run
                 folder.
-            quality: compact, html: dB of PSNR that the training views may lose.
-            target_mb: compact, html: write a file of at most this many megabytes in place of
+            quality: compact, html, streamed-html: dB of PSNR that the training views may lose.
+            target_mb: compact, html, streamed-html: write a file of at most this many megabytes in place of
                 `quality`; 0: any size.
             sh_degree: Standard files: degree of the spherical harmonics, 0 to 3.
             max_gaussians: Standard files: keep this many Gaussians, those that contribute most; 0
@@ -315,9 +315,7 @@ class Run:
                 unknown or out of range.
             RunError: The disk is full.
         """
-        options = Options(
-            False, quality, target_mb, sh_degree, max_gaussians, prune, refine, frame, crop, floaters, title, cells, photographs=photographs
-        )
+        options = checked.fields(Options, {**locals(), "measure": False})
         expect_words(options)
         folder, opened = self._in_folder("export"), self._opened
         if self._device != "cpu":

@@ -5,10 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import fields
+from typing import TYPE_CHECKING
 
 from scene_experts.core.errors import InputError
 from scene_experts.files.options import DEFAULT, MAX_DEGREE, Options
 from scene_experts.files.registry import GAUSSIANS, Format, format_named
+
+if TYPE_CHECKING:
+    from scene_experts.files.standard import ExportTask
 
 DRAWN_OPTIONS = ("measure", "crop", "cells")  # of formats that hold what pictures show
 FITTED = ("quality", "target_mb")  # options of formats that choose a precision
@@ -56,8 +60,22 @@ def expect_unused(options: Options, format: str) -> None:
             if format_named(format).fit is None:
                 raise InputError(f"expected {_flag(f.name)} with --format compact or html, found --format {format}; leave it out")
         else:
-            which = "a standard file (ply, spz, baked-html, ...)"
+            which = "--format mesh" if f.name == "cells" else "a standard file (ply, spz, baked-html, ...)"
             raise InputError(f"expected {_flag(f.name)} with {which}, found --format {format}; leave it out")
+
+
+def expect_used(works: Sequence[ExportTask]) -> None:
+    """Raises InputError for an option of the exports that none of them has."""
+    options, formats = works[0].options, [work.format for work in works]
+    names = ", ".join(work.name for work in works)
+    if options.cells != DEFAULT.cells and all(format.family == GAUSSIANS for format in formats):
+        raise InputError(f"expected --cells with --format mesh, found --format {names}; leave it out")
+    if options.title is not None and not any(format.view_note for format in formats):
+        raise InputError(f"expected --title with --format html, found --format {names}; leave it out")
+    standard = [work for work in works if work.format.family == GAUSSIANS]
+    if options.refine and standard and all(work.is_direct for work in standard):
+        rows = "the Gaussians are written as they are"
+        raise InputError(f"expected --refine with a scene that is baked, found {rows} in --format {names}; leave it out, or train longer")
 
 
 def expect_drawn(options: Options, format: str) -> None:

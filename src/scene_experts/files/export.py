@@ -10,7 +10,8 @@ from typing import Any
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import check_writable, write_bytes, write_json
 from scene_experts.data.views import Capture, World
-from scene_experts.files.accepted import FITTED, check_values, expect_drawn, expect_fitted, expect_unused
+from scene_experts.files.accepted import FITTED, check_values, expect_drawn, expect_fitted, expect_unused, expect_used
+from scene_experts.files.gaussians.read import forget_description
 from scene_experts.files.measure import OF_THE_FORMAT, Tell, capture_if_there, cost
 from scene_experts.files.options import DEFAULT, Options
 from scene_experts.files.placed import AROUND, place_cameras
@@ -99,12 +100,13 @@ def export_several(
             check_writable(places[-1])
             if work.format.needs is not None:
                 work.format.needs()
-    # the other options are those of the standard files then
-    kept = {name: getattr(options, name) for name in ("measure", "photographs", *FITTED)}
-    own = Options(**kept) if standard else options
+    expect_used(works)
     written = [_export_drawn(work, out) for work in works if work.format.draw is not None]
     rest = [work for work in works if work.format.draw is None and work.format.family != GAUSSIANS]
-    written += [_export_scene(replace(work, options=own), out) for work in rest]
+    for work in rest:  # the other options are those of the other files, if there are any
+        own = Options(**{name: getattr(options, name) for name in ("measure", "photographs", *FITTED)})
+        own = replace(own, title=options.title) if work.format.view_note is not None else own
+        written.append(_export_scene(replace(work, options=options if len(rest) == len(works) else own), out))
     if standard:
         made: dict[tuple[int | None, int], Made] = {}
         selects = bool(options.crop) or options.floaters == "remove"
@@ -220,10 +222,11 @@ def _export_scene(work: ExportTask, out: Path | None) -> Written:
                 contents, fitted = format.fit(run, contents, trained, work.options, capture, work.rasterize, work.tell)
             note = _view_note(work, capture, world)
     detail = format.write(path, contents, note)  # type: ignore[misc]
+    forget_description(path)
     rows, size = len(run.scene.positions), path.stat().st_size if format.size is None else format.size(path)
     said = f"{rows:,} {traits.rows}, {size / 1e6:.2f} MB with networks"
     said += "" if detail is None else f"{', ' if format.size is None else ': '}{detail}"
-    written = Written(path, size, rows, (f"wrote {path}", said, *fitted))
+    written = Written(path, size, rows, (f"wrote {path}", said, *fitted), work.name)
     if not work.options.measure or format.read is None:
         return written
     with capture_if_there(run, needed=False) as capture:
@@ -247,7 +250,7 @@ def _export_drawn(work: ExportTask, out: Path | None) -> Written:
     format.write(path, contents, note)
     size, said = path.stat().st_size, str(contents)
     write_json(path.with_name(path.name + ".json"), {"format": NOTE_FORMAT, "recipe": run.config.train.recipe, "step": run.step, **note})
-    return Written(path, size, len(contents), (f"wrote {path}", f"{said}, {size / 1e6:.2f} MB, in the capture's own frame"))
+    return Written(path, size, len(contents), (f"wrote {path}", f"{said}, {size / 1e6:.2f} MB, in the capture's own frame"), work.name)
 
 
 def _view_note(work: ExportTask, capture: Capture | None, world: World) -> Note:
@@ -274,7 +277,7 @@ def _export_folder(work: ExportTask, family: Family, world: World, out: Path) ->
     said = f"{rows:,} {run.scene.traits.rows}, {size / 1e6:.2f} MB with networks, in the capture's own frame"
     origin = origin_of(run, world)
     said += f", {tell_origin(origin)}" if any(origin) else ""
-    return Written(folder, size, rows, (f"wrote {folder}", said, *family.warnings(run)))
+    return Written(folder, size, rows, (f"wrote {folder}", said, *family.warnings(run)), work.name)
 
 
 def _files(run: OpenRun, path: Path, levels: bool) -> list[tuple[int | None, Path]]:

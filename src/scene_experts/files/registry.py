@@ -314,5 +314,6 @@ def exported_files(folder: Path) -> list[Path]:
     named = [path for path in sorted(folder.glob("scene*")) if path.is_file() and _OWN_NAME.fullmatch(path.name)]
     if not named:
         return []
+    parts = sorted(folder.glob("scene.parts/*-*.bin"))  # of a streamed page
     suffixes = {format_named(name).suffix for name in format_names()} - {""}
-    return [path for path in named if path.name.removesuffix(".json")[path.name.index(".") :] in suffixes]
+    return parts + [path for path in named if path.name.removesuffix(".json")[path.name.index(".") :] in suffixes]

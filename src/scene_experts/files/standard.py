@@ -38,6 +38,8 @@ class Written:
     """Anchors, Gaussians or points in it."""
     lines: tuple[str, ...]
     """The same in sentences, for a terminal."""
+    format: str = ""
+    """Name of the format."""
     psnr: dict[str, float] = field(default_factory=dict)
     """Mean PSNR of the held-out views against the photographs, dB, drawn from the "run" and from
     the "file", for a baked scene also from its "closed_form" and its "bake"; empty where nothing
@@ -134,7 +136,7 @@ def export_gaussians(
         how = "; of the same bake" if not fresh else f"; baked in {format_duration(one.seconds)}" if one.seconds else "; of the run's bake"
         how += " from cameras around the scene" if around else ""
         lines = (f"wrote {path}", said + (how if bake else ""), *one.lines, *([str(told)] if told is not None else []))
-        written = Written(path, facts["bytes"], len(contents), lines)
+        written = Written(path, facts["bytes"], len(contents), lines, work.name)
         if options.measure and format.read is not None and not options.crop:
 
             def scenes() -> dict[str, tuple[Scene, int]]:

@@ -87,6 +87,9 @@ def test_words_that_mean_nothing_are_named(run, tmp_path):
     for words in ({"frame": "world"}, {"floaters": "drop"}):
         with pytest.raises(se.InputError, match=naming(*words, *words.values())):
             run.export("ply", tmp_path / "scene.ply", **words)
+    for number in ({"sh_degree": 1.5}, {"cells": 1}, {"max_gaussians": 10.5}, {"refine": "5"}, {"quality": "0.1"}):
+        with pytest.raises(se.InputError, match=naming(*number)):
+            run.export("ply", tmp_path / "scene.ply", **number)
     assert before == {path: path.stat().st_mtime_ns for path in run.path.rglob("*")} and not list(tmp_path.iterdir())
 
 

@@ -318,3 +318,33 @@ def test_a_precision_that_no_format_has_is_refused_at_once(tmp_path):
         export_run(tmp_path / "run", "mesh", tmp_path / "a", quality=0.5)
     (page,) = export_run(tmp_path / "run", "html", tmp_path / "a.html", target_mb=0.09)
     assert page.bytes <= 90_000
+
+
+def test_options_that_no_file_has_are_refused_and_a_title_is_kept_beside_other_files(tmp_path):
+    data = make_capture(tmp_path / "capture", views=4, size=(24, 16), points=60).folder
+    words = ["--data", str(data), "--iterations", "5", "--device", "cpu", "--preview-every", "0"]
+    for recipe in ("scaffold-gs", "3dgs"):
+        assert main(["train", recipe, "--out", str(tmp_path / recipe), *words]) == 0
+    direct = tmp_path / "3dgs"
+    for format, options in {"ply": {"cells": 16}, "spz": {"title": "X"}, "splat": {"refine": 300}}.items():
+        with pytest.raises(InputError, match=naming(f"--{next(iter(options))}", format)):
+            export_run(direct, format, tmp_path / "a", **options)
+    with pytest.raises(InputError, match=naming("--cells", "--format mesh")):
+        export_run(tmp_path / "scaffold-gs", "compact", tmp_path / "a", cells=16)
+    run = run_folder.open_run(tmp_path / "scaffold-gs")
+    pages = export_several(run, ("html", "compact", "ply"), tmp_path / "several", Options(title="My title", refine=0, measure=False))
+    assert "<title>My title</title>" in next(one.path.read_text() for one in pages if one.path.suffix == ".html")
+
+
+def test_a_page_takes_the_place_of_another_with_its_description_and_parts(tmp_path):
+    data = make_capture(tmp_path / "capture", views=5, size=(24, 16), points=60).folder
+    words = ["--data", str(data), "--iterations", "5", "--device", "cpu", "--preview-every", "0"]
+    assert main(["train", "scaffold-gs", "--out", str(tmp_path / "run"), *words]) == 0
+    page = tmp_path / "page.html"
+    export_run(tmp_path / "run", "streamed-html", page)
+    parts, note = page.with_suffix(".parts"), page.with_name("page.html.json")
+    (parts / "mine.txt").write_text("stays")
+    export_run(tmp_path / "run", "baked-html", page, refine=0)
+    assert [part.name for part in parts.iterdir()] == ["mine.txt"] and note.is_file()
+    export_run(tmp_path / "run", "html", page)
+    assert not note.exists()

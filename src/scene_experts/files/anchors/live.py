@@ -62,6 +62,7 @@ def write(path: Path, data: AnchorData, note: dict[str, Any]) -> str:
     encoded, sizes = compact.encode(data)
     page, pictures = make_page(data, note, encoded), sum(4 * ((len(picture) + 2) // 3) for picture in note.get("pictures", ()))
     write_bytes(Path(path), page)
+    html.forget_parts(Path(path))
     photographs = f"{pictures:,} bytes of photographs, " if pictures else ""
     return f"{len(page) - 4 * ((len(encoded) + 2) // 3) - pictures:,} bytes of page and script, {photographs}{sizes}"
 

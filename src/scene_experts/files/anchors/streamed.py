@@ -7,7 +7,6 @@ them. The page knows the length and the checksum of each, and their names change
 
 from __future__ import annotations
 
-import re
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,9 +34,7 @@ from scene_experts.training.run_folder import OpenRun
 GENERATOR = "scene-experts streamed"
 MARK = f'<meta name="generator" content="{GENERATOR}">'.encode()
 CODE = "streamed.min.js.gz"
-FOLDER = ".parts"  # behind the name of the page without its suffix
 MORE = 1.075  # times the bytes of a compact file, at most about
-_NAME = re.compile(r"(coarse|plan|\d{2})-[0-9a-f]{8}\.bin")
 _MOST_PART = 1 << 40  # bytes
 _SUM = 4  # bytes of the CRC-32 that every part ends in
 
@@ -47,7 +44,7 @@ def write(path: Path, contents: Layered, note: dict[str, Any]) -> str:
     the bytes are for. Raises as `live.write`."""
     live.expect_drawable(contents.data)
     made = layers.encode(contents.data, contents.rows, contents.coarse, contents.given)
-    folder, listed = Path(path).with_suffix(FOLDER), []
+    folder, listed = Path(path).with_suffix(html.PARTS), []
     folder.mkdir(parents=True, exist_ok=True)
     for name, part in [("coarse", made.coarse), ("plan", made.plan), *((f"{i:02}", chunk) for i, chunk in enumerate(made.chunks))]:
         checksum = _checksum(part)
@@ -57,7 +54,7 @@ def write(path: Path, contents: Layered, note: dict[str, Any]) -> str:
     settings |= {"exact": settings["exact"] or not live.fits_halves(contents.coarse), "folder": folder.name, "parts": listed}
     write_bytes(Path(path), html.make_page(GENERATOR, note, settings, b"", CODE, live.LICENCE))
     for old in folder.iterdir():
-        if _NAME.fullmatch(old.name) and old.name not in {name for name, *_ in listed}:
+        if html.PART_NAME.fullmatch(old.name) and old.name not in {name for name, *_ in listed}:
             old.unlink()
     page, share = Path(path).stat().st_size, len(made.coarse) / made.size
     return f"page {page / 1e6:.2f}, {len(listed)} parts {made.size / 1e6:.2f} in {folder.name}, shown after {share:.0%} of them"
@@ -65,7 +62,7 @@ def write(path: Path, contents: Layered, note: dict[str, Any]) -> str:
 
 def size(path: Path) -> int:
     """The bytes of a page that `write` has just made, and of its parts."""
-    parts = [part for part in Path(path).with_suffix(FOLDER).iterdir() if _NAME.fullmatch(part.name)]
+    parts = [part for part in Path(path).with_suffix(html.PARTS).iterdir() if html.PART_NAME.fullmatch(part.name)]
     return sum(file.stat().st_size for file in (Path(path), *parts))
 
 
@@ -103,7 +100,7 @@ class _Part:
     @classmethod
     def listed(cls, name: Any, size: Any, checksum: Any) -> _Part:
         """Raises Damaged for an entry that `write` does not make."""
-        if not isinstance(name, str) or not _NAME.fullmatch(name):
+        if not isinstance(name, str) or not html.PART_NAME.fullmatch(name):
             raise Damaged("no list of parts")
         size = whole_number(size, "the length of a part", 0, _MOST_PART)
         return cls(name, size, whole_number(checksum, "a checksum", 0, 0xFFFFFFFF))

@@ -14,6 +14,7 @@ import base64
 import html as markup
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from importlib.resources import files
@@ -48,6 +49,8 @@ MARK = b'<meta name="generator" content="scene-experts">'
 _SCENE, _SETTINGS = b'<script type="text/plain" id="scene">', b'<script type="application/json" id="settings">'
 _MOST = 60  # the unit of the scene lies within 2 to the power of this
 _HARMLESS = 0.01  # share of Gaussians whose clipped sizes nobody sees
+PARTS = ".parts"  # the folder of a streamed page: behind its name without its suffix
+PART_NAME = re.compile(r"(coarse|plan|\d{2})-[0-9a-f]{8}\.bin")
 FLIGHT = 48  # poses of the flight, between which the page interpolates
 _FOV = 50.0  # degrees, without a camera
 Pose = dict[str, Any]
@@ -61,8 +64,19 @@ def write(path: Path, splats: Splats, note: dict[str, Any]) -> str | None:
     settings, scene = page_settings(splats, note, centre), scaled(splats, unit_of(splats))
     licences = (ASSETS / "LICENCES.txt").read_text()
     write_bytes(path, make_page("scene-experts", note, settings, spz_bytes(scene), "viewer.min.js.gz", licences))
+    forget_parts(path)
     clipped = float(out_of_range(scene).float().mean()) if len(scene) else 0.0
     return size_warning(scene) if clipped > _HARMLESS else None
+
+
+def forget_parts(path: Path) -> None:
+    """Remove the parts of a streamed page that a page with everything in it has replaced."""
+    folder = path.with_suffix(PARTS)
+    for part in folder.iterdir() if folder.is_dir() else ():
+        if PART_NAME.fullmatch(part.name):
+            part.unlink()
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
 
 
 def make_page(generator: str, note: Mapping[str, Any], settings: Mapping[str, Any], scene: bytes, code: str, licences: str) -> bytes:

@@ -174,6 +174,12 @@ def beside(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
+def forget_description(path: Path) -> None:
+    """Remove the description beside a file that another one has replaced."""
+    if beside(path).keys() & {"gaussians", "bytes"}:
+        path.with_name(path.name + ".json").unlink(missing_ok=True)
+
+
 def is_antialiased(path: Path) -> bool:
     """Whether the description beside a file, or without one the file itself, says that it is drawn
     with antialiasing.
