@@ -147,17 +147,20 @@ def make_card(
     lines += [f"![{scene}]({PREVIEW})", "", f"A 3D scene of Gaussians, trained from photographs by {maker} with"]
     lines += [f"the recipe `{recipe}` for {run.step:,} iterations.", "", "| file | content |", "|---|---|"]
     for file in files:
-        folder = file.path.is_dir()  # point_cloud/iteration_N of a result folder
-        name = f"{file.path.parent.name}/{file.path.name}" if folder else file.path.name
-        kind = f"{run.scene.traits.rows} with their networks" if folder or file.path.suffix == ".compact" else "Gaussians"
-        lines.append(f"| `{name}` | {file.rows:,} {kind}, {file.bytes / 1e6:.1f} MB |")
+        folder, format = file.path.is_dir(), format_named(file.format)  # a folder: point_cloud/iteration_N of a result folder
+        name = f"`{file.path.parent.name}/{file.path.name}`" if folder else f"`{file.path.name}`"
+        name += f", `{file.path.stem}.parts`" if format.size is not None and file.path.suffix == ".html" else ""
+        kind = "Gaussians" if format.family == GAUSSIANS else f"{run.scene.traits.rows} with their networks"
+        content = "a mesh" if format.draw is not None else f"{file.rows:,} {kind}"
+        lines.append(f"| {name} | {content}, {file.bytes / 1e6:.1f} MB |")
     lines += ["", "## Open it", ""]
-    if imports:
+    readable = [file for file in files if file.path.is_dir() or format_named(file.format).read is not None]
+    if imports and readable:
         lines += ["```sh", "pip install scene-experts"]
         lines += ["# CAPTURE: folder of its photographs with poses; the run can be drawn, scored and converted"]
-        lines += [f"scene-experts import {'.' if files[0].path.is_dir() else files[0].path.name} --data CAPTURE --out RUN"]
+        lines += [f"scene-experts import {'.' if readable[0].path.is_dir() else readable[0].path.name} --data CAPTURE --out RUN"]
         lines += ["```", ""]
-    else:
+    elif not imports:
         lines += ["The Gaussians are in the frame that the scene was trained in, not in that of its photographs.", ""]
     if any(file.path.suffix == ".spz" for file in files):
         lines += ["Viewers of Gaussian splats open the `.spz` file directly.", ""]

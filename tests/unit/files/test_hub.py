@@ -31,7 +31,7 @@ def test_the_card_states_licence_tags_scores_and_files(tmp_path):
     train = SimpleNamespace(recipe="moe-gs")
     run = SimpleNamespace(config=SimpleNamespace(train=train, data=SimpleNamespace(path=tmp_path / "banana")), step=2000)
     run.scene = SimpleNamespace(traits=SimpleNamespace(rows="anchors"))
-    files = [Written(tmp_path / "scene.compact", 3_000_000, 400, ()), Written(tmp_path / "scene.spz", 900_000, 4000, ())]
+    files = [Written(tmp_path / "scene.compact", 3_000_000, 400, (), "compact"), Written(tmp_path / "scene.spz", 900_000, 4000, (), "spz")]
     scores = {"psnr": 27.25, "ssim": 0.9, "lpips": None, "view_count": 2, "split": "mod8", "resolution": "longest:800"}
     head, body = front_matter(hub.make_card(run, files, scores, "mit", ["CAPTURE_LICENSE"]))  # type: ignore[arg-type]
     assert head["license"] == "mit" and {"gaussian-splatting", "moe-gs"} <= set(head["tags"])
@@ -58,11 +58,22 @@ def test_the_card_names_a_result_folder_and_offers_no_import_that_would_be_refus
     run = SimpleNamespace(config=config, step=40, scene=SimpleNamespace(traits=SimpleNamespace(rows="anchors")))
     folder = tmp_path / "point_cloud" / "iteration_40"
     folder.mkdir(parents=True)
-    card = hub.make_card(run, [Written(folder, 3_000_000, 400, ())], {}, "mit", [])  # type: ignore[arg-type]
+    card = hub.make_card(run, [Written(folder, 3_000_000, 400, (), "anchors")], {}, "mit", [])  # type: ignore[arg-type]
     assert "| `point_cloud/iteration_40` | 400 anchors with their networks" in card and "scene-experts import . --data" in card
-    spz = [Written(tmp_path / "scene.spz", 900_000, 4000, ())]
+    spz = [Written(tmp_path / "scene.spz", 900_000, 4000, (), "spz")]
     card = hub.make_card(run, spz, {}, "mit", [], imports=False)  # type: ignore[arg-type]
     assert "scene-experts import" not in card and "trained in" in card and "`.spz`" in card
+
+
+def test_the_card_says_what_pages_and_meshes_hold_and_imports_what_can_be_read(tmp_path):
+    config = SimpleNamespace(train=SimpleNamespace(recipe="moe-gs"), data=SimpleNamespace(path=tmp_path / "banana"))
+    run = SimpleNamespace(config=config, step=40, scene=SimpleNamespace(traits=SimpleNamespace(rows="anchors")))
+    mesh = Written(tmp_path / "scene.mesh.ply", 900_000, 4000, (), "mesh")
+    page = Written(tmp_path / "scene.html", 900_000, 400, (), "streamed-html")
+    card = hub.make_card(run, [mesh, page], {}, "mit", [])  # type: ignore[arg-type]
+    assert "`scene.mesh.ply` | a mesh" in card and "`scene.html`, `scene.parts` | 400 anchors with their networks" in card
+    assert "import scene.html --data" in card
+    assert "import" not in hub.make_card(run, [mesh], {}, "mit", [])  # type: ignore[arg-type]
 
 
 def test_scores_are_those_of_the_iteration_that_is_written(tmp_path, caplog):
