@@ -62,6 +62,7 @@ class Page {
     this.controls.addEventListener("start", () => { this.held = false; this.flight = null; this.wake(); });
     this.controls.addEventListener("change", () => this.wake());
     canvas.addEventListener("wheel", () => { this.held = false; this.wake(); }, { passive: true });
+    canvas.addEventListener("webglcontextlost", () => say("The browser took the graphics away; load the page again"));
     addEventListener("resize", () => this.resize());
     addEventListener("hashchange", () => this.readHash());
     addEventListener("keydown", (event) => this.press(event));

@@ -2,7 +2,7 @@
 const WIDTH = 4095; // texels of a row of the texture; a Gaussian has three
 const VERTEX = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D;
-uniform usampler2D words; uniform mat4 view; uniform vec4 lens; uniform vec2 size; uniform bool antialias;
+uniform usampler2D words; uniform mat4 view; uniform vec4 lens; uniform vec2 size; uniform bool antialias; uniform float near;
 uniform uint mask; uniform bool coloured; uniform vec3 palette[16];
 in uint id;
 out vec2 d; flat out vec4 color;
@@ -14,6 +14,7 @@ void main() {
   mat3 V = mat3(s.x, s.y, s.z, s.y, t.x, t.y, s.z, t.y, t.z);
   vec2 rg = unpackHalf2x16(w.y), ba = unpackHalf2x16(w.z);
   gl_Position = vec4(2, 2, 2, 1);
+  if (m.z <= near) return; // the order may be that of an earlier view
   if ((mask >> w.w & 1u) == 0u) return;
   vec2 more = 0.15 * size / lens.xy, tan = clamp(m.xy / m.z, -lens.zw / lens.xy - more, (size - lens.zw) / lens.xy + more);
   mat3 rows = transpose(mat3(view));
@@ -124,6 +125,7 @@ export class GlRenderer {
     gl.uniformMatrix4fv(draws.at("view"), true, [...rows.flat(), 0, 0, 0, 1]);
     gl.uniform4f(draws.at("lens"), view.fx, view.fy, view.cx, view.cy);
     gl.uniform2f(draws.at("size"), width, height);
+    gl.uniform1f(draws.at("near"), view.near);
     gl.uniform1i(draws.at("antialias"), settings.antialias ? 1 : 0);
     gl.uniform1ui(draws.at("mask"), view.look?.mask ?? 0xffffffff);
     gl.uniform1i(draws.at("coloured"), view.look?.coloured ? 1 : 0);

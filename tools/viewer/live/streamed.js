@@ -95,18 +95,22 @@ async function load(page) {
   say("");
   tell = makeLine();
   page.parts = 0; // chunks that are shown
-  let planned = false, taken = 0;
+  let planned = false, taken = 0, arrived = []; // arrived: parts that were asked for ahead
   const goOn = async () => {
     try {
       came(0);
       if (!planned) await ask("plan", { bytes: await fetchPart(parts[1]) });
       planned = true;
-      for (let arrived = [], i = 2 + taken; i < parts.length; ) {
+      for (let i = 2 + taken; i < parts.length; ) {
         if (!arrived.length) arrived = [fetchPart(parts[i])];
         const bytes = await arrived.shift();
         if (i + 1 < parts.length) arrived.push(fetchPart(parts[i + 1])); // while this one is decoded
         arrived.forEach((promise) => promise.catch(() => {}));
-        await ask("chunk", { bytes });
+        await ask("chunk", { bytes }).catch((error) => {
+          came(-bytes.length); // it will be fetched again, and the next one with it
+          arrived.splice(0).forEach((promise) => promise.then((later) => came(-later.length), () => {}));
+          throw error;
+        });
         i += 1;
         taken += 1;
         await ask("show");
