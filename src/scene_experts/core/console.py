@@ -19,4 +19,6 @@ class LastingConsole(Console):
         with suppress(SystemExit, OSError, ValueError):  # rich leaves stdout to nobody, where it is a file of the system, and exits
             super().on_broken_pipe()
         print("nothing reads the output any more: the command is interrupted", file=sys.stderr)
+        if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as of what a shell starts in the background
+            raise KeyboardInterrupt
         signal.raise_signal(signal.SIGINT)

@@ -8,7 +8,7 @@ import shutil
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -73,7 +73,8 @@ def replacing(folder: Path, first: bool = True) -> Iterator[Path]:
         yield new
         return
     new.parent.mkdir(parents=True, exist_ok=True)
-    with locked(new.with_name(".eval.lock"), f"another evaluation writes to {folder.parent}; wait until it ends"):
+    lock = new.with_name(".eval.lock")
+    with locked(lock, f"another evaluation writes to {folder.parent}; wait until it ends"):
         shutil.rmtree(new, ignore_errors=True)
         try:
             yield new
@@ -84,6 +85,8 @@ def replacing(folder: Path, first: bool = True) -> Iterator[Path]:
                     os.replace(new / name, folder / name)
         finally:
             shutil.rmtree(new, ignore_errors=True)
+            with suppress(OSError):  # Windows removes no open file
+                lock.unlink()
 
 
 def write_picture(path: Path, pixels: np.ndarray, sync: bool = True) -> None:

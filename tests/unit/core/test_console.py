@@ -9,7 +9,8 @@ import pytest
 from scene_experts.core.console import LastingConsole
 
 WRITES = """
-import os, sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.{})
 from scene_experts.core.console import LastingConsole
 console = LastingConsole(markup=False)
 try:
@@ -23,8 +24,11 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no broken pipes of this kind")
-def test_a_reader_that_goes_away_interrupts_the_command_which_can_save():
-    with subprocess.Popen([sys.executable, "-c", WRITES], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+@pytest.mark.parametrize("handler", ["default_int_handler", "SIG_IGN"])  # ignored: in the background of a shell
+def test_a_reader_that_goes_away_interrupts_the_command_which_can_save(handler):
+    with subprocess.Popen(
+        [sys.executable, "-c", WRITES.format(handler)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout.readline() == "0\n"
         process.stdout.close()
         said = process.stderr.read()
