@@ -82,6 +82,8 @@ def find_photos(folder: Path, exclude: Path | None = None, say: Callable[[str], 
     """
     written = list[Path]()
     files = list_files(folder, exclude, written)
+    if written:  # before there may be too few
+        say(tell_written(written, folder))
     paths = [path for path in files if path.suffix.lower() in EXTENSIONS]
     paths += find_heic(files, {path.with_suffix("") for path in paths}, folder)
     every = {path.relative_to(folder).as_posix(): path for path in paths}
@@ -93,8 +95,6 @@ def find_photos(folder: Path, exclude: Path | None = None, say: Callable[[str], 
         raise InputError(f"expected at least {FEWEST} photographs ({', '.join(EXTENSIONS)}) in {folder}, found {len(names)}; {advice}")
     for line in describe_rest(found, names, sorted(set(files) - set(paths)), folder):
         say(line)
-    if written:
-        say(tell_written(written, folder))
     photos = decide_round(inspect_photos(folder, names, found))
     white, notes = find_white([(folder / photo.name, photo.mode) for photo in photos])
     for line in notes:

@@ -84,11 +84,11 @@ def test_new_pictures_replace_old_ones_when_all_are_written(tmp_path: Path) -> N
     with pytest.raises(ZeroDivisionError), pictures.replacing(tmp_path / "test") as new:
         pictures.write_picture(new / "renders" / "new.png", np.zeros((2, 2), np.uint8))
         raise ZeroDivisionError
-    assert old.is_file() and [p.name for p in tmp_path.iterdir() if p.is_dir()] == ["test"]
+    assert old.is_file() and [p.name for p in tmp_path.iterdir()] == ["test"]
     with pictures.replacing(tmp_path / "test") as new:
         pictures.write_picture(new / "renders" / "new.png", np.zeros((2, 2), np.uint8))
     assert [p.name for p in (tmp_path / "test" / "renders").iterdir()] == ["new.png"]
-    assert [p.name for p in tmp_path.iterdir() if p.is_dir()] == ["test"]
+    assert [p.name for p in tmp_path.iterdir()] == ["test"]
 
 
 def test_two_evaluations_of_one_run_do_not_write_into_each_other(tmp_path: Path) -> None:

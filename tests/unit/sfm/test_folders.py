@@ -2,8 +2,10 @@
 
 import pytest
 
+from scene_experts.core.errors import InputError
 from scene_experts.sfm.folders import list_files
 from scene_experts.sfm.photos import find_photos
+from support.messages import naming
 from support.photos import write_photo
 
 RESULTS = {
@@ -27,6 +29,16 @@ def test_results_in_the_folder_are_no_photographs_and_are_told(tmp_path, files):
     told = []
     assert [photo.name for photo in find_photos(tmp_path, say=told.append)] == ["1.jpg", "2.jpg", "more/3.jpg"]
     assert "more/result/" in told[0]
+
+
+def test_what_was_left_out_is_told_where_too_few_photographs_remain(tmp_path):
+    for i in range(3):
+        write_photo(tmp_path / "sub" / "images" / f"{i}.jpg")
+    (tmp_path / "sub" / "capture.json").write_text("{}")
+    told = []
+    with pytest.raises(InputError, match=naming(3, 0)):
+        find_photos(tmp_path, say=told.append)
+    assert len(told) == 1 and "sub/" in told[0]
 
 
 def test_the_folder_that_was_named_is_looked_at_whatever_it_holds(tmp_path):
