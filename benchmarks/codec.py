@@ -4,16 +4,24 @@
 
 Writes the run's compact file, and prints the CPU seconds to fit its models, to code it with them and
 to decode it, and anchors per second: the least of several turns. Peer: zlib, level 9, of the file
-that holds the same scene as it is (--format anchors).
+that holds the same scene as it is (--format anchors). Where there are Node and Chromium, they read
+the file by integrations/javascript too, compiled and plain: the first time in a new process or
+tab, and the least of several. Chromium's are seconds of the clock.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import shutil
+import subprocess
 import tempfile
+import threading
 import time
 import zlib
 from collections.abc import Callable
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +33,25 @@ from scene_experts.files.anchors.data import AnchorData
 from scene_experts.files.codec.fit import fit_models
 
 TURNS = 7
+READER = Path(__file__).resolve().parents[1] / "integrations" / "javascript"
+PROGRAM = """
+const { plain } = await import(`${folder}/coder.mjs`), { readCompact } = await import(`${folder}/compact.mjs`), found = [];
+for (let i = 0; i < TURNS; ++i) {
+  const began = now();
+  await readCompact(bytes, how === "plain" ? plain : undefined);
+  found.push(now() - began);
+}
+console.log(JSON.stringify([found[0], Math.min(...found)]));
+""".replace("TURNS", str(TURNS))
+NODE = """
+import { readFileSync } from "node:fs";
+const [folder, path, how] = process.argv.slice(1), bytes = new Uint8Array(readFileSync(path));
+const now = () => { const { user, system } = process.cpuUsage(); return (user + system) / 1e6; };
+"""
+PAGE = """<script type=module>
+const folder = "/javascript", how = location.hash.slice(1), now = () => performance.now() / 1e3;
+const bytes = new Uint8Array(await (await fetch("/scene.compact")).arrayBuffer());
+"""
 
 
 def least(work: Callable[[], object]) -> float:
@@ -56,6 +83,40 @@ def written(run: se.Run, folder: Path) -> tuple[AnchorData, bytes, Path]:
     return given[-1], file.read_bytes(), exact
 
 
+def in_node(file: Path, how: str) -> list[float]:
+    """CPU seconds of the first reading and the least."""
+    command = ["node", "--input-type=module", "-e", NODE + PROGRAM, READER.as_uri(), str(file), how]
+    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    """A server of files that says nothing."""
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def in_chromium(file: Path, how: str) -> list[float]:
+    """Seconds of the first reading and the least."""
+    from playwright.sync_api import sync_playwright
+
+    with tempfile.TemporaryDirectory() as folder:
+        shutil.copytree(READER, Path(folder) / "javascript")
+        shutil.copy(file, Path(folder) / "scene.compact")
+        (Path(folder) / "index.html").write_text(PAGE + PROGRAM + "</script>")
+        server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=folder))
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        with sync_playwright() as p:
+            browser = p.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+            tab = browser.new_page()
+            with tab.expect_console_message(lambda message: message.text.startswith("["), timeout=300_000) as said:
+                tab.goto(f"http://127.0.0.1:{server.server_port}/#{how}")
+            found = json.loads(said.value.text)
+            browser.close()
+        server.shutdown()
+        return found
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
@@ -77,11 +138,14 @@ def main() -> None:
                 compact.decode(file, source)
                 seconds.append(time.process_time() - began)
         rows["decode"] = min(seconds)
+        for name, read in (("node", in_node), ("chromium", in_chromium)):
+            for how in ("compiled", "plain") if shutil.which(name) else ():
+                rows[f"{name}, {how}, first"], rows[f"{name}, {how}"] = read(Path(folder) / "scene.compact", how)
         packed = zlib.compress(plain, 9)
         rows["zlib, pack"], rows["zlib, unpack"] = least(lambda: zlib.compress(plain, 9)), least(lambda: zlib.decompress(packed))
     print(f"{n:,} anchors; {len(file):,} bytes, exact {len(plain):,}, by zlib {len(packed):,}")
     for name, value in rows.items():
-        print(f"{name}: {value:.3f} CPU s, {n / value / 1e6:.2f} M anchors/s")
+        print(f"{name}: {value:.3f} {'s' if name.startswith('chromium') else 'CPU s'}, {n / value / 1e6:.2f} M anchors/s")
 
 
 if __name__ == "__main__":

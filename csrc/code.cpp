@@ -32,20 +32,18 @@ int64_t tail(int64_t u) {
   return (e << kShare) / ((int64_t{1} << kFraction) + e);
 }
 
-// The logistic distribution function at t / 8 steps.
-int64_t below(int scale, int64_t t) {
-  const int64_t slope = kSlopes[scale & 7] >> (scale >> 3);
-  return t <= 0 ? tail(-t * slope) : (int64_t{1} << kShare) - tail(t * slope);
-}
-
 CodeTables make_tables() {
   CodeTables tables;
-  for (int i = 0; i < kCodeScales; ++i)
+  for (int i = 0; i < kCodeScales; ++i) {
+    constexpr int kMost = 8 * kCodeHalf + 8;
+    int64_t tails[kMost + 1];  // beyond t / 8 steps, t = 0, 1 ...
+    for (int t = 0; t <= kMost; ++t) tails[t] = tail(t * (kSlopes[i & 7] >> (i >> 3)));
+    const auto below = [&](int t) { return t <= 0 ? tails[-t] : (int64_t{1} << kShare) - tails[t]; };  // the logistic distribution function
     for (int p = 0; p < kCodePhases; ++p) {
       uint16_t* row = tables.below[i * kCodePhases + p];
-      const int64_t first = below(i, -8 * kCodeHalf - p);
+      const int64_t first = below(-8 * kCodeHalf - p);
       for (int s = 0; s < kCodeSymbols; ++s)
-        row[s] = static_cast<uint16_t>(s + ((below(i, 8 * (s - kCodeHalf) - p) - first) * ((1 << kCodeBits) - kCodeSymbols) >> kShare));
+        row[s] = static_cast<uint16_t>(s + ((below(8 * (s - kCodeHalf) - p) - first) * ((1 << kCodeBits) - kCodeSymbols) >> kShare));
       row[kCodeSymbols] = 1 << kCodeBits;
       uint8_t* start = tables.start[i * kCodePhases + p];
       int s = 0;
@@ -54,6 +52,7 @@ CodeTables make_tables() {
         start[share] = static_cast<uint8_t>(s);
       }
     }
+  }
   for (int i = 0; i <= kCodeTopOdds; ++i) {
     const int64_t least = tail(static_cast<int64_t>(std::abs(i - 64)) << (kFraction - 3));  // the share of the rarer bit
     const int64_t zeros = i <= 64 ? (int64_t{1} << kShare) - least : least;

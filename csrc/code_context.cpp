@@ -5,6 +5,8 @@
 #include <vector>
 #if defined(__AVX2__)
 #include <immintrin.h>
+#elif defined(__wasm_simd128__)
+#include <wasm_simd128.h>
 #endif
 
 #include "code.h"
@@ -47,42 +49,61 @@ void add_rows(const std::vector<Term>& terms, int64_t begin, int64_t count, int3
 
 #if defined(__AVX2__)
 constexpr int64_t kWide = 16;  // rows at once
-
-// The two weights of a pair of inputs in each lane.
-inline __m256i pair_of(int16_t first, int16_t second) {
-  return _mm256_set1_epi32(static_cast<int32_t>(static_cast<uint16_t>(first) | static_cast<uint32_t>(static_cast<uint16_t>(second)) << 16));
-}
-
-inline void add_to(int32_t* sums, __m256i added) {
-  auto* at = reinterpret_cast<__m256i*>(sums);
+using Wide = __m256i;
+inline Wide read_wide(const int16_t* at) { return _mm256_loadu_si256(reinterpret_cast<const Wide*>(at)); }
+inline Wide low_pairs(Wide a, Wide b) { return _mm256_unpacklo_epi16(a, b); }
+inline Wide high_pairs(Wide a, Wide b) { return _mm256_unpackhi_epi16(a, b); }
+inline Wide same_pairs(uint32_t pair) { return _mm256_set1_epi32(static_cast<int32_t>(pair)); }
+inline void add_products(int32_t* sums, Wide a, Wide x, Wide b, Wide y) {
+  auto* at = reinterpret_cast<Wide*>(sums);
+  const Wide added = _mm256_add_epi32(_mm256_madd_epi16(a, x), _mm256_madd_epi16(b, y));
   _mm256_storeu_si256(at, _mm256_add_epi32(_mm256_loadu_si256(at), added));
 }
+// Pairs leave the sums of 16 rows in the order 0 - 3, 8 - 11, 4 - 7, 12 - 15.
+inline void sort_rows(int32_t* sums) {
+  auto* at = reinterpret_cast<Wide*>(sums);
+  const Wide low = _mm256_loadu_si256(at), high = _mm256_loadu_si256(at + 1);
+  _mm256_storeu_si256(at, _mm256_permute2x128_si256(low, high, 0x20));
+  _mm256_storeu_si256(at + 1, _mm256_permute2x128_si256(low, high, 0x31));
+}
+#elif defined(__wasm_simd128__)
+constexpr int64_t kWide = 8;
+using Wide = v128_t;
+inline Wide read_wide(const int16_t* at) { return wasm_v128_load(at); }
+inline Wide low_pairs(Wide a, Wide b) { return wasm_i16x8_shuffle(a, b, 0, 8, 1, 9, 2, 10, 3, 11); }
+inline Wide high_pairs(Wide a, Wide b) { return wasm_i16x8_shuffle(a, b, 4, 12, 5, 13, 6, 14, 7, 15); }
+inline Wide same_pairs(uint32_t pair) { return wasm_u32x4_splat(pair); }
+inline void add_products(int32_t* sums, Wide a, Wide x, Wide b, Wide y) {
+  const Wide added = wasm_i32x4_add(wasm_i32x4_dot_i16x8(a, x), wasm_i32x4_dot_i16x8(b, y));
+  wasm_v128_store(sums, wasm_i32x4_add(wasm_v128_load(sums), added));
+}
+inline void sort_rows(int32_t*) {}
+#endif
 
-// Add terms to the sums of `count` rows, a multiple of kWide. Two inputs are multiplied and added by one instruction, which leaves the sums
-// of 16 rows in the order 0 - 3, 8 - 11, 4 - 7, 12 - 15 until all terms are added.
+#if defined(__AVX2__) || defined(__wasm_simd128__)
+#define SE_WIDE 1
+// The two weights of a pair of inputs in each lane.
+inline Wide pair_of(int16_t first, int16_t second) {
+  return same_pairs(static_cast<uint16_t>(first) | static_cast<uint32_t>(static_cast<uint16_t>(second)) << 16);
+}
+
+// Add terms to the sums of `count` rows, a multiple of kWide. Two inputs are multiplied and added by one instruction.
 void add_wide(const std::vector<Term>& terms, int64_t begin, int64_t count, int32_t* mean, int32_t* spread) {
   for (size_t k = 0; k < terms.size(); k += kTogether) {
     const Term* t = &terms[k];
-    const __m256i mean0 = pair_of(t[0].mean, t[1].mean), mean1 = pair_of(t[2].mean, t[3].mean);
-    const __m256i spread0 = pair_of(t[0].spread, t[1].spread), spread1 = pair_of(t[2].spread, t[3].spread);
-    const auto read = [&](int j, int64_t i) { return _mm256_loadu_si256(reinterpret_cast<const __m256i*>(t[j].inputs + begin + i)); };
+    const Wide mean0 = pair_of(t[0].mean, t[1].mean), mean1 = pair_of(t[2].mean, t[3].mean);
+    const Wide spread0 = pair_of(t[0].spread, t[1].spread), spread1 = pair_of(t[2].spread, t[3].spread);
+    const auto read = [&](int j, int64_t i) { return read_wide(t[j].inputs + begin + i); };
     for (int64_t i = 0; i < count; i += kWide) {
-      const __m256i a = read(0, i), b = read(1, i), c = read(2, i), d = read(3, i);
-      const __m256i low0 = _mm256_unpacklo_epi16(a, b), high0 = _mm256_unpackhi_epi16(a, b);
-      const __m256i low1 = _mm256_unpacklo_epi16(c, d), high1 = _mm256_unpackhi_epi16(c, d);
-      add_to(mean + i, _mm256_add_epi32(_mm256_madd_epi16(low0, mean0), _mm256_madd_epi16(low1, mean1)));
-      add_to(mean + i + 8, _mm256_add_epi32(_mm256_madd_epi16(high0, mean0), _mm256_madd_epi16(high1, mean1)));
-      add_to(spread + i, _mm256_add_epi32(_mm256_madd_epi16(low0, spread0), _mm256_madd_epi16(low1, spread1)));
-      add_to(spread + i + 8, _mm256_add_epi32(_mm256_madd_epi16(high0, spread0), _mm256_madd_epi16(high1, spread1)));
+      const Wide a = read(0, i), b = read(1, i), c = read(2, i), d = read(3, i);
+      const Wide low0 = low_pairs(a, b), high0 = high_pairs(a, b), low1 = low_pairs(c, d), high1 = high_pairs(c, d);
+      add_products(mean + i, low0, mean0, low1, mean1);
+      add_products(mean + i + kWide / 2, high0, mean0, high1, mean1);
+      add_products(spread + i, low0, spread0, low1, spread1);
+      add_products(spread + i + kWide / 2, high0, spread0, high1, spread1);
     }
   }
-  for (int64_t i = 0; i < count; i += kWide)  // rows in their order
-    for (int32_t* sums : {mean + i, spread + i}) {
-      auto* at = reinterpret_cast<__m256i*>(sums);
-      const __m256i low = _mm256_loadu_si256(at), high = _mm256_loadu_si256(at + 1);
-      _mm256_storeu_si256(at, _mm256_permute2x128_si256(low, high, 0x20));
-      _mm256_storeu_si256(at + 1, _mm256_permute2x128_si256(low, high, 0x31));
-    }
+  for (int64_t i = 0; i < count; i += kWide) sort_rows(mean + i), sort_rows(spread + i);
 }
 #endif
 
@@ -108,7 +129,7 @@ SE_EXPORT void se_code_predict(const int16_t** inputs, const int8_t* weights, co
     std::fill(sums[0], sums[0] + n, numbers[0]);
     std::fill(sums[1], sums[1] + n, numbers[2]);
     int64_t done = 0;
-#if defined(__AVX2__)
+#if SE_WIDE
     done = n / kWide * kWide;
     add_wide(terms, begin, done, sums[0], sums[1]);
 #endif

@@ -1,4 +1,4 @@
-// Reads compact files of scene-experts (docs/compact-file.md). One file, no dependencies; browsers and Node 18 or newer.
+// Reads compact files of scene-experts (docs/compact-file.md). No dependencies beyond the files beside it; browsers and Node 18 or newer.
 // Licence: Apache-2.0.
 //
 //   const scene = await readCompact(bytes);   // bytes: Uint8Array
@@ -6,185 +6,15 @@
 // returns {header, cells, lattice, groups, networks, exact, checksum}: the whole numbers of the file in coding order; cells are [N, 3] in one
 // array. A value of a group is number * header.steps[group][channel] * 2 ** class, without the class in the group "extra"; a weight is
 // number * 2 ** (exponent / 2).
-// Throws an Error for files that it does not read, and where the checksum of the numbers differs.
+// Throws an Error for files that it does not read, and where the checksum of the numbers differs. readCompact(bytes, plain), with `plain` of
+// coder.mjs, reads without WebAssembly; so does any call where it or its SIMD is missing.
+import { loadCoder } from "./compiled.mjs";
+import { Reader, TOP, UNIT, fail, inflate } from "./coder.mjs";
 
-const BITS = 15, WHOLE = 1 << BITS, LANES = 4, FLOOR = 65536, HALF = 40, SYMBOLS = 82, TOP = 127;
-const SLOPES = [193635251, 177564308, 162827188, 149313190, 136920799, 125556926, 115136209, 105580369];
-const ROOTS = [
-  47453133, 56431603, 61539100, 64263668, 65670859, 66385968, 66746437, 66927405,
-  67018073, 67063453, 67086155, 67097508, 67103186, 67106025, 67107444, 67108154,
-];
-const ONE = 2 ** 26, SHARE = 2 ** 20; // products of these stay below 2^53, so numbers are exact
-export const UNIT = 32;
-const MANTISSA = 80, STEP = 24, REACH = 2047, LARGEST = 1 << 26;
+const MANTISSA = 80, STEP = 24, MOST_INPUTS = 4096, MOST_FACTOR = 2 ** 20, MOST_NUMBER = 2 ** 28, MOST_WEIGHT = 127;
 export const LOW_CLASS = -2, CLASSES = 7, LEVELS = 3;
 
-export function fail(what) {
-  throw new Error(`expected a compact file that this version reads, found ${what}`);
-}
-export const clamp = (value, low, high) => (value < low ? low : value > high ? high : value);
-
-// ---- Tables -----------------------------------------------------------------------------------------------------------------------------
-
-function power(u) {
-  const whole = Math.floor(u / ONE);
-  if (whole >= 26) return 0;
-  const rest = u - whole * ONE;
-  let e = ONE;
-  for (let b = 1; b <= 16; ++b) if ((rest >> (26 - b)) & 1) e = Math.floor((e * ROOTS[b - 1]) / ONE);
-  return Math.floor(e / 2 ** whole);
-}
-function tail(u) {
-  const e = power(u);
-  return Math.floor((e * SHARE) / (ONE + e));
-}
-const rows = new Uint16Array(48 * 8 * (SYMBOLS + 1)), starts = new Uint8Array(48 * 8 * 64), made = new Uint8Array(48 * 8);
-// Fills row `at` of the tables; starts has the last entry that begins at or below each 64th of the places.
-function makeTable(scale, phase, at) {
-  const slope = SLOPES[scale & 7] >> (scale >> 3), from = at * (SYMBOLS + 1);
-  const below = (t) => (t <= 0 ? tail(-t * slope) : SHARE - tail(t * slope));
-  const first = below(-8 * HALF - phase);
-  for (let s = 0; s < SYMBOLS; ++s) rows[from + s] = s + Math.floor(((below(8 * (s - HALF) - phase) - first) * (WHOLE - SYMBOLS)) / SHARE);
-  rows[from + SYMBOLS] = WHOLE;
-  for (let part = 0, entry = 0; part < 64; ++part) {
-    while (rows[from + entry + 1] <= part * 512) ++entry;
-    starts[64 * at + part] = entry;
-  }
-  made[at] = 1;
-}
-const zeros = Array.from({ length: TOP + 1 }, (_, odds) => {
-  const least = tail(Math.abs(odds - 64) * 2 ** 23);
-  return 1 + Math.floor(((odds <= 64 ? SHARE - least : least) * (WHOLE - 2)) / SHARE);
-});
-
-// ---- Streams ----------------------------------------------------------------------------------------------------------------------------
-
-export class Reader {
-  constructor(bytes) {
-    if (bytes.length % 2 || bytes.length < 4 * LANES) fail("a stream that is cut short");
-    this.words = new Uint16Array(bytes.slice().buffer);
-    this.state = new Uint32Array(this.words.slice(0, 2 * LANES).buffer);
-    if (this.state.some((x) => x < FLOOR)) fail("a stream with a wrong start");
-    this.at = 2 * LANES;
-    this.operations = 0;
-  }
-  place() {
-    return this.state[this.operations & 3] & (WHOLE - 1);
-  }
-  take(start, width) {
-    const lane = this.operations++ & 3;
-    let x = this.state[lane];
-    x = width * (x >>> BITS) + (x & (WHOLE - 1)) - start; // below 2^32
-    if (x < FLOOR) {
-      if (this.at >= this.words.length) fail("a stream that is cut short");
-      x = x * 65536 + this.words[this.at++];
-    }
-    this.state[lane] = x;
-  }
-  raw(bits) {
-    const value = this.place() >> (BITS - bits);
-    this.take(value << (BITS - bits), 1 << (BITS - bits));
-    return value;
-  }
-  bit(share) {
-    const one = this.place() >= share;
-    this.take(one ? share : 0, one ? WHOLE - share : share);
-    return one ? 1 : 0;
-  }
-  symbol(mean, scale) {
-    mean = clamp(mean, -(1 << 28), 1 << 28);
-    scale = clamp(scale, 0, TOP);
-    const centre = (mean + 4) >> 3, low = scale < 48 ? 0 : ((scale - 48) >> 3) + 1;
-    const table = 8 * (scale - 8 * low) + (low ? 4 : mean - 8 * centre + 4);
-    if (!made[table]) makeTable(scale - 8 * low, low ? 4 : mean - 8 * centre + 4, table);
-    const place = this.place(), from = table * (SYMBOLS + 1);
-    let entry = starts[64 * table + (place >> 9)];
-    while (rows[from + entry + 1] <= place) ++entry;
-    this.take(rows[from + entry], rows[from + entry + 1] - rows[from + entry]);
-    if (entry === SYMBOLS - 1) return this.escape(centre, low);
-    return low ? this.widen(centre, entry - HALF, low) : centre + entry - HALF;
-  }
-  widen(centre, symbol, low) {
-    const value = centre + symbol * 2 ** low + this.raw(low) - ((1 << low) >> 1);
-    if (value < -(2 ** 31) || value >= 2 ** 31) fail("a number of too many bits");
-    return value;
-  }
-  escape(centre, low) {
-    const form = this.raw(7);
-    let left = form >> 1, beyond = 1;
-    if (left > 32) fail("a number of too many bits");
-    while (left > 0) {
-      const part = Math.min(left, BITS);
-      left -= part;
-      beyond = beyond * 2 ** part + this.raw(part);
-    }
-    const symbol = form & 1 ? -(beyond + HALF) : beyond + HALF;
-    if (low) return this.widen(centre, symbol, low);
-    if (centre + symbol < -(2 ** 31) || centre + symbol >= 2 ** 31) fail("a number of too many bits");
-    return centre + symbol;
-  }
-  symbols(count, scale, mean = 0) {
-    const out = new Int32Array(count);
-    for (let i = 0; i < count; ++i) out[i] = this.symbol(mean, typeof scale === "number" ? scale : scale[i]);
-    return out;
-  }
-  finish() {
-    if (this.at !== this.words.length || this.state.some((x) => x !== FLOOR)) fail("a stream that is longer than its contents");
-  }
-}
-
-// ---- Cells ------------------------------------------------------------------------------------------------------------------------------
-
-const ONES = Uint8Array.from({ length: 256 }, (_, mask) => mask.toString(2).replaceAll("0", "").length);
-
-// The cells of an octree, [count, 3]. A node has its place, its neighbours across six faces (-1: none) and its children as bits.
-function readCells(reader, depth, count) {
-  const zero = new Uint16Array(2048), one = new Uint16Array(2048);
-  let n = 1, nodes = new Int32Array(3), beside = new Int32Array(6).fill(-1);
-  for (let level = 0; level < depth; ++level) {
-    const children = new Uint8Array(n), first = new Int32Array(n + 1), left = Math.min(depth - 1 - level, 3);
-    for (let i = 0; i < n; ++i) {
-      let own = 0;
-      for (let b = 0; b < 8; ++b) {
-        if (b === 7 && !own) {
-          own = 128;
-          continue;
-        }
-        let state = 0;
-        for (let a = 0; a < 3; ++a) {
-          const high = (b >> a) & 1, other = b ^ (1 << a), node = beside[6 * i + 2 * a + high];
-          state = 4 * state + (high ? 2 * ((own >> other) & 1) + (node >= 0 ? 1 : 0) : node < 0 ? 0 : 1 + ((children[node] >> other) & 1));
-        }
-        const key = (left * 8 + b) * 64 + state, share = Math.floor(((2 * zero[key] + 1) * WHOLE) / (2 * (zero[key] + one[key]) + 2));
-        const found = reader.bit(clamp(share, 32, WHOLE - 32));
-        own |= found << b;
-        if (found) one[key] += 1;
-        else zero[key] += 1;
-        if (zero[key] + one[key] > 1023) (zero[key] = (zero[key] + 1) >> 1), (one[key] = (one[key] + 1) >> 1);
-      }
-      children[i] = own;
-      first[i + 1] = first[i] + ONES[own];
-      if (first[i + 1] > count) fail("more cells than there are");
-    }
-    const next = new Int32Array(3 * first[n]), around = new Int32Array(6 * first[n]);
-    const child = (node, b) => (node < 0 || !((children[node] >> b) & 1) ? -1 : first[node] + ONES[children[node] & ((1 << b) - 1)]);
-    for (let i = 0, at = 0; i < n; ++i)
-      for (let b = 0; b < 8; ++b)
-        if ((children[i] >> b) & 1) {
-          for (let a = 0; a < 3; ++a) {
-            const high = (b >> a) & 1, other = b ^ (1 << a);
-            next[3 * at + a] = 2 * nodes[3 * i + a] + high;
-            for (let up = 0; up < 2; ++up) around[6 * at + 2 * a + up] = child(high !== up ? i : beside[6 * i + 2 * a + up], other);
-          }
-          ++at;
-        }
-    n = first[n];
-    nodes = next;
-    beside = around;
-  }
-  if (n !== count) fail("another number of cells");
-  return nodes;
-}
+// ---- Places -----------------------------------------------------------------------------------------------------------------------------
 
 // The bit of the highest axis in which two cells of `fine` differ decides, z before y before x.
 export function compareMorton(fine, i, j) {
@@ -196,13 +26,12 @@ export function compareMorton(fine, i, j) {
   return fine[3 * i + axis] - fine[3 * j + axis];
 }
 
-// Whether two cells are in the same box of the curve, which leaves out the last `bits` bits of keys.
-function sameBox(fine, i, j, bits) {
-  for (let a = 0; a < 3; ++a) {
-    const out = Math.floor(bits / 3) + (a < bits % 3 ? 1 : 0);
-    if (fine[3 * i + a] >> out !== fine[3 * j + a] >> out) return false;
-  }
-  return true;
+// Whether the cell of each anchor is in another box of the curve than the one before; boxes leave out the last `bits` bits of keys.
+function findFirsts(fine, bits) {
+  const [x, y, z] = [0, 1, 2].map((a) => Math.floor(bits / 3) + (a < bits % 3 ? 1 : 0)), out = new Uint8Array(fine.length / 3).fill(1);
+  for (let i = 1, j = 3; i < out.length; ++i, j += 3)
+    out[i] = (fine[j] ^ fine[j - 3]) >> x || (fine[j + 1] ^ fine[j - 2]) >> y || (fine[j + 2] ^ fine[j - 1]) >> z ? 1 : 0;
+  return out;
 }
 
 // Rows [n, 3] of an array, by their numbers.
@@ -212,12 +41,12 @@ export function pick(from, rows, Kind) {
   return out;
 }
 
-// Cells, lattices and fine cells of all anchors, along the curve.
-export function readPlaces(header, reader) {
+// Cells, lattices and fine cells of all anchors, along the curve. coder: what reads cells.
+export function readPlaces(header, reader, coder) {
   const N = header.N;
   let own = new Float64Array(3 * N), lattice = new Uint8Array(N), wide = new Float64Array(3 * N), at = 0;
   header.lattices.forEach(([, , multiple, low, count, distinct, depth], number) => {
-    const found = readCells(reader, depth, distinct);
+    const found = coder.readCells(reader, depth, distinct);
     const more = distinct < count ? reader.symbols(distinct, STEP) : new Int32Array(distinct);
     for (let i = 0; i < distinct; ++i)
       for (let k = 0; k <= more[i]; ++k, ++at) {
@@ -255,6 +84,7 @@ export function makeGroups(header) {
   for (const g of groups) {
     const fixed = LEVELS + (g.steps ? CLASSES : 0) + g.own.reduce((sum, name) => sum + channels[name], 0) + (g.parents ? g.channels : 0);
     g.inputs = Array.from({ length: g.channels }, (_, c) => fixed + (g.chain ? c : 0));
+    if (fixed + g.channels > MOST_INPUTS) fail("a model of too many inputs");
   }
   return groups;
 }
@@ -281,15 +111,14 @@ export function readModel(reader, group) {
   model.offset = readCoarse(reader, group.refines ? 0 : C);
   const scales = [readDifferences(reader, C, 0, TOP), readDifferences(reader, C, 0, TOP)];
   for (let c = 0; c < C; ++c) model.weights.push(scales.map((scale) => reader.symbols(group.inputs[c], scale[c])));
+  const within = (numbers, low, high) => numbers.every((v) => v >= low && v <= high);
+  const fits = [model.meanBias, model.scaleBias, model.offset].every((numbers) => within(numbers, -MOST_NUMBER, MOST_NUMBER));
+  if (!fits || !within(model.factor, 1, MOST_FACTOR) || !model.weights.flat().every((row) => within(row, -MOST_WEIGHT, MOST_WEIGHT)))
+    fail("a model with numbers out of range"); // the sums could not bear them
   return model;
 }
 
 // ---- The walk ---------------------------------------------------------------------------------------------------------------------------
-
-function shifted(sum, shift) {
-  if (shift > 0) return (sum + ((1 << shift) >> 1)) >> shift;
-  return clamp(sum, -(LARGEST >> -shift), LARGEST >> -shift) * 2 ** -shift;
-}
 
 // Four parents of each anchor in coding order, and their weights, [N, 4] each. curve: coding place of each anchor along the curve.
 export function findParents(fine, curve, level) {
@@ -307,82 +136,45 @@ export function findParents(fine, curve, level) {
         let away = 1;
         for (let a = 0; a < 3; ++a) away += Math.abs(fine[3 * i + a] - fine[3 * other + a]);
         found[to + j] = curve[other];
-        total += weights[to + j] = there ? Math.floor(65536 / away) : 0;
+        total += weights[to + j] = there ? (65536 / away) | 0 : 0;
       }
-      for (let j = 0; j < 4; ++j) weights[to + j] = total ? Math.floor((weights[to + j] * 256) / total) : 0;
+      for (let j = 0; j < 4; ++j) weights[to + j] = total ? ((weights[to + j] * 256) / total) | 0 : 0;
     }
   }
   return { found, weights };
 }
 
-// The inputs [end - begin, width] of a group's anchors, without those of its chain.
-function makeInputs(g, width, level, begin, end, values, columns, parents) {
-  const inputs = new Int16Array(width * (end - begin)), classes = values.class[0];
-  let at = LEVELS;
-  for (let i = begin, row = 0; i < end; ++i, row += width) {
-    inputs[row + level] = UNIT;
-    if (g.steps) inputs[row + LEVELS + classes[i] - LOW_CLASS] = UNIT;
-  }
-  if (g.steps) at += CLASSES;
-  for (const name of g.own)
-    for (const column of columns[name]) {
-      for (let i = begin, to = at; i < end; ++i, to += width) inputs[to] = column[i];
-      ++at;
-    }
-  if (!g.parents) return inputs;
-  const { found, weights } = parents;
-  for (const column of columns[g.name]) {
-    for (let i = begin, to = at; i < end; ++i, to += width) {
-      const j = 4 * i, a = weights[j] * column[found[j]] + weights[j + 1] * column[found[j + 1]];
-      inputs[to] = (a + weights[j + 2] * column[found[j + 2]] + weights[j + 3] * column[found[j + 3]]) >> 8;
-    }
-    ++at;
-  }
+// The inputs for the level, and in groups with a class those for it: `which` of the levels is set.
+export function kindInputs(g, which, classes) {
+  const n = classes.length, none = new Int16Array(n), inputs = [none, none, none];
+  inputs[which] = new Int16Array(n).fill(UNIT);
+  if (!g.steps) return inputs;
+  for (let kind = 0; kind < CLASSES; ++kind) inputs.push(new Int16Array(n));
+  for (let i = 0; i < n; ++i) inputs[LEVELS + classes[i] - LOW_CLASS][i] = UNIT;
   return inputs;
 }
 
-// Reads one channel of the anchors from `begin` to `end`. kept: whether its values are inputs later.
-export function readChannel(g, c, model, reader, inputs, width, begin, end, classes, live, to, column, kept) {
-  const [w, v] = model.weights[c], D = g.inputs[c], factor = model.factor[c], offset = model.offset[c];
-  const meanBias = model.meanBias[c], scaleBias = model.scaleBias[c], meanShift = model.meanShift[c], scaleShift = model.scaleShift[c];
-  for (let i = begin, row = 0; i < end; ++i, row += width) {
-    if (live && !live[i]) continue;
-    let mean = meanBias, scale = scaleBias; // below 2^31 with all inputs
-    for (let d = 0; d < D; ++d) {
-      const x = inputs[row + d];
-      mean = (mean + Math.imul(w[d], x)) | 0;
-      scale = (scale + Math.imul(v[d], x)) | 0;
-    }
-    const own = g.steps ? classes[i] : 0, fine = own + 2;
-    mean = (clamp(shifted(mean, meanShift), -LARGEST, LARGEST) + ((1 << fine) >> 1)) >> fine;
-    scale = clamp(shifted(scale, scaleShift) + 32 - 8 * own, 0, TOP);
-    const value = g.binary ? reader.bit(zeros[scale]) : reader.symbol(mean, scale);
-    to[i] = value;
-    if (!kept) continue;
-    const reach = Math.floor(2 ** 29 / factor) >> fine;
-    const scaled = clamp(value, -reach, reach) * 2 ** fine * factor - offset;
-    column[i] = clamp((scaled + 2048) >> 12, -REACH, REACH);
-    if (g.chain) inputs[row + D] = column[i];
-  }
+export function expectClasses(classes) {
+  if (!classes.every((v) => v >= LOW_CLASS && v < LOW_CLASS + CLASSES)) fail("a step class out of range");
 }
 
-function readGroups(groups, models, readers, N, ends, parents) {
+function readGroups(groups, models, readers, N, ends, parents, coder) {
   const values = {}, columns = {};
   for (const g of groups) {
     values[g.name] = Array.from({ length: g.channels }, () => new Int32Array(N));
-    columns[g.name] = Array.from({ length: g.channels }, () => new Int16Array(N));
+    columns[g.name] = Array.from({ length: g.chain ? g.channels : 0 }, () => new Int16Array(N));
   }
   for (let level = 0; level < LEVELS; ++level) {
     const begin = level ? ends[level - 1] : 0, end = ends[level];
     for (const g of groups) {
-      const kept = g.chain || g.parents || groups.some((o) => o.own.includes(g.name)), width = g.inputs[0] + (g.chain ? g.channels : 0);
-      const inputs = makeInputs(g, width, level, begin, end, values, columns, parents), classes = values.class[0];
-      for (let c = 0; c < g.channels; ++c) {
-        const live = g.masked ? values.slots[Math.floor(c / 3)] : null;
-        readChannel(g, c, models[g.name], readers[g.name], inputs, width, begin, end, classes, live, values[g.name][c], columns[g.name][c], kept);
-        if (g.name !== "class") continue;
-        for (let i = begin; i < end; ++i) if (classes[i] < LOW_CLASS || classes[i] >= LOW_CLASS + CLASSES) fail("a step class out of range");
-      }
+      const classes = g.steps ? Int8Array.from(values.class[0].subarray(begin, end)) : new Int8Array(end - begin);
+      const inputs = kindInputs(g, level, classes);
+      for (const name of g.own) for (const column of columns[name]) inputs.push(column.subarray(begin, end));
+      if (g.parents) inputs.push(...coder.blend(columns[g.name], parents.found.subarray(4 * begin, 4 * end), parents.weights.subarray(4 * begin, 4 * end)));
+      const live = g.masked ? values.slots.map((slot) => slot.subarray(begin, end)) : null;
+      const own = values[g.name].map((channel) => channel.subarray(begin, end)), made = columns[g.name].map((column) => column.subarray(begin, end));
+      coder.readRows(g, models[g.name], readers[g.name], inputs, classes, live, own, made);
+      if (g.name === "class") expectClasses(own[0]);
     }
   }
   for (const g of groups) readers[g.name].finish();
@@ -409,20 +201,27 @@ function readNetwork(reader, name, shape) {
 
 // ---- The file ---------------------------------------------------------------------------------------------------------------------------
 
-const crcTable = Uint32Array.from({ length: 256 }, (_, n) => {
-  for (let k = 0; k < 8; ++k) n = n & 1 ? (n >>> 1) ^ 0xedb88320 : n >>> 1;
-  return n;
-});
+// The remainders of each byte with 0 to 7 bytes behind it, [8, 256].
+const REMAINDERS = new Int32Array(8 * 256);
+for (let n = 0; n < 256; ++n) {
+  let c = n;
+  for (let k = 0; k < 8; ++k) c = c & 1 ? (c >>> 1) ^ 0xedb88320 : c >>> 1;
+  REMAINDERS[n] = c;
+}
+for (let i = 256; i < REMAINDERS.length; ++i) REMAINDERS[i] = REMAINDERS[REMAINDERS[i - 256] & 255] ^ (REMAINDERS[i - 256] >>> 8);
 export function crc32(bytes, before = 0) {
-  let c = ~before;
-  for (let i = 0; i < bytes.length; ++i) c = crcTable[(c ^ bytes[i]) & 255] ^ (c >>> 8);
+  const R = REMAINDERS, view = new DataView(bytes.buffer, bytes.byteOffset, bytes.length), n = bytes.length;
+  let c = ~before, i = 0;
+  for (; i + 8 <= n; i += 8) {
+    const d = view.getInt32(i + 4, true);
+    c ^= view.getInt32(i, true);
+    c = R[1792 | (c & 255)] ^ R[1536 | ((c >>> 8) & 255)] ^ R[1280 | ((c >>> 16) & 255)] ^ R[1024 | (c >>> 24)];
+    c ^= R[768 | (d & 255)] ^ R[512 | ((d >>> 8) & 255)] ^ R[256 | ((d >>> 16) & 255)] ^ R[d >>> 24];
+  }
+  for (; i < n; ++i) c = R[(c ^ bytes[i]) & 255] ^ (c >>> 8);
   return ~c >>> 0;
 }
 export const bytesOf = (numbers) => new Uint8Array(numbers.buffer, numbers.byteOffset, numbers.byteLength); // browsers run on little-endian machines
-export async function inflate(bytes) {
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-  return new Uint8Array(await new Response(stream).arrayBuffer());
-}
 
 // The header and the parts by name of a file that begins with `mark`.
 export async function open(bytes, mark, version) {
@@ -437,13 +236,14 @@ export async function open(bytes, mark, version) {
   return { header, parts };
 }
 
-export async function readCompact(bytes) {
+export async function readCompact(bytes, coder) {
+  coder ??= await loadCoder();
   const { header, parts } = await open(bytes, "SXCOMP2\n", 2);
 
   // the order: level by level, along the curve within a level
-  const { own, lattice, fine } = readPlaces(header, new Reader(parts.positions)), N = header.N;
-  const level = new Uint8Array(N).fill(2), order = new Int32Array(N), curve = new Int32Array(N), ends = [];
-  for (const number of [1, 0]) for (let i = 0; i < N; ++i) if (!i || !sameBox(fine, i, i - 1, header.boxes[number])) level[i] = number;
+  const { own, lattice, fine } = readPlaces(header, new Reader(parts.positions), coder), N = header.N;
+  const order = new Int32Array(N), curve = new Int32Array(N), ends = [], [coarsest, coarse] = header.boxes.map((bits) => findFirsts(fine, bits));
+  const level = coarse.map((isFirst, i) => (coarsest[i] ? 0 : isFirst ? 1 : 2));
   for (let l = 0, at = 0; l < LEVELS; ++l) {
     for (let i = 0; i < N; ++i) if (level[i] === l) (order[at] = i), (curve[i] = at++);
     ends.push(at);
@@ -453,15 +253,15 @@ export async function readCompact(bytes) {
   for (const g of groups) models[g.name] = readModel(stream, g);
   stream.finish();
   for (const g of groups) readers[g.name] = new Reader(parts[g.name]);
-  const values = readGroups(groups, models, readers, N, ends, findParents(fine, curve, level));
+  const values = readGroups(groups, models, readers, N, ends, findParents(fine, curve, level), coder);
 
   const networks = {}, exact = {}, weights = new Reader(parts.networks);
-  const floats = await inflate(parts.exact), numbers = new DataView(floats.buffer);
+  const floats = await inflate(parts.exact);
   let from = 0;
   header.networks.forEach(([name, shape], i) => {
     if (i < header.rounded) return void (networks[name] = readNetwork(weights, name, shape));
     const size = shape.reduce((a, b) => a * b, 1);
-    exact[name] = { shape, values: Float32Array.from({ length: size }, (_, k) => numbers.getFloat32(from + 4 * k, true)) };
+    exact[name] = { shape, values: new Float32Array(floats.slice(from, from + 4 * size).buffer) };
     from += 4 * size;
   });
   weights.finish();
@@ -473,5 +273,5 @@ export async function readCompact(bytes) {
   checksum = crc32(floats, checksum);
   if (checksum !== header.integers) fail("numbers with another checksum");
   const cells = pick(own, order, Float64Array);
-  return { header, cells, lattice: Uint8Array.from(order, (i) => lattice[i]), groups: values, networks, exact, checksum };
+  return { header, cells, lattice: lattice.map((_, i) => lattice[order[i]]), groups: values, networks, exact, checksum };
 }

@@ -8,9 +8,10 @@
 //
 // Throws an Error for files that it does not read, for parts of another page, and where the checksum of all numbers differs.
 import {
-  CLASSES, LEVELS, LOW_CLASS, Reader, UNIT, bytesOf, clamp, compareMorton, crc32, fail, findParents, makeGroups, open, pick, readChannel, readModel,
-  readPlaces,
+  CLASSES, LEVELS, bytesOf, compareMorton, crc32, expectClasses, findParents, kindInputs, makeGroups, open, pick, readModel, readPlaces,
 } from "./compact.mjs";
+import { loadCoder } from "./compiled.mjs";
+import { Reader, asInputs, clamp, fail } from "./coder.mjs";
 
 const ADDED = 0, COARSE = 1; // which of the inputs for levels is set
 const MOST_CHUNKS = 64, AXIS = 2 ** 21, LARGEST = 2 ** 30;
@@ -62,21 +63,21 @@ export function expectPart(bytes, [name, size, checksum]) {
 }
 
 export class LayeredScene {
-  // coarse: what readCompact returns; plan: the bytes that belong to it.
-  static async open(coarse, plan) {
+  // coarse: what readCompact returns; plan: the bytes that belong to it; coder: as of readCompact.
+  static async open(coarse, plan, coder) {
     const { header, parts } = await open(plan, "SXPLAN1\n", 1);
     if (header.coarse !== coarse.checksum) fail("the plan of another scene");
-    return new LayeredScene(coarse, header, parts);
+    return new LayeredScene(coarse, header, parts, coder ?? (await loadCoder()));
   }
 
-  constructor(coarse, header, parts) {
+  constructor(coarse, header, parts, coder) {
     const more = header.N - coarse.header.N, { chunks } = header, groups = makeGroups({ ...coarse.header, slots: header.slots });
-    const places = merge(coarse, readPlaces({ N: more, lattices: header.lattices }, new Reader(parts.positions)), header.lattices), { rows } = places;
+    const places = merge(coarse, readPlaces({ N: more, lattices: header.lattices }, new Reader(parts.positions), coder), header.lattices), { rows } = places;
     if (!coarse.groups.slots || chunks.length > MOST_CHUNKS || [...chunks].sort((a, b) => a - b).some((v, i) => v !== i)) fail("another plan");
     const isCoarse = Uint8Array.from(rows, (row) => (row < coarse.header.N ? 1 : 0)), numbers = Int32Array.from(rows.keys());
     const parents = findParents(places.fine, numbers, isCoarse.map((v) => 1 - v)), stream = new Reader(parts.models), models = {};
     const refined = refinedGroups(groups);
-    Object.assign(this, { coarse, header, places, isCoarse, parents, groups, refined, models, known: isCoarse.slice(), taken: 0, total: chunks.length });
+    Object.assign(this, { coder, coarse, header, places, isCoarse, parents, groups, refined, models, known: isCoarse.slice(), taken: 0, total: chunks.length });
     for (const g of groups) models[g.name] = readModel(stream, g);
     for (const g of refined) models[`${g.name}+`] = { ...readModel(stream, g), factor: models[g.name].factor, offset: models[g.name].offset };
     stream.finish();
@@ -91,51 +92,30 @@ export class LayeredScene {
 
   // The values [N] of a channel as inputs; 0 for anchors that are not coarse.
   inputsOf(g, c, values) {
-    const { factor, offset } = this.models[g.name], classes = this.values.class[0], out = new Int16Array(values.length);
-    for (let i = 0; i < out.length; ++i) {
-      if (!this.isCoarse[i]) continue;
-      const fine = (g.steps ? classes[i] : 0) + 2, reach = Math.floor(2 ** 29 / factor[c]) >> fine;
-      out[i] = clamp((clamp(values[i], -reach, reach) * 2 ** fine * factor[c] - offset[c] + 2048) >> 12, -2047, 2047);
-    }
-    return out;
+    const { factor, offset } = this.models[g.name], classes = g.steps ? this.values.class[0] : new Int8Array(values.length);
+    const out = new Int16Array(values.length);
+    asInputs(values, classes, factor[c], offset[c], out);
+    return out.map((v, i) => (this.isCoarse[i] ? v : 0));
   }
 
-  // The inputs [rows, width] of a group without those of its chain.
-  makeInputs(g, width, kind, rows) {
-    const inputs = new Int16Array(width * rows.length), classes = this.values.class[0], { found, weights } = this.parents;
-    let at = LEVELS;
-    const fill = (value) => {
-      for (let j = 0, to = at; j < rows.length; ++j, to += width) inputs[to] = value(rows[j]);
-      ++at;
-    };
-    for (let j = 0; j < rows.length; ++j) {
-      inputs[j * width + kind] = UNIT;
-      if (g.steps) inputs[j * width + LEVELS + classes[rows[j]] - LOW_CLASS] = UNIT;
-    }
-    if (g.steps) at += CLASSES;
-    for (const name of g.own) for (const column of this.columns[name]) fill((i) => column[i]);
-    for (const column of g.parents ? this.columns[g.name] : [])
-      fill((i) => {
-        const j = 4 * i, a = weights[j] * column[found[j]] + weights[j + 1] * column[found[j + 1]];
-        return (a + weights[j + 2] * column[found[j + 2]] + weights[j + 3] * column[found[j + 3]]) >> 8;
-      });
-    for (const column of g.refines ? this.columns[g.name] : []) fill((i) => column[i]);
-    return inputs;
-  }
-
-  // Reads the channels of a group at rows. live: by slot, whether values of a row are there; null: all are.
+  // Reads the channels of a group at rows. kind: ADDED or COARSE; live: by slot, whether values of a row are there; null: all are.
   run(g, reader, kind, rows, live) {
-    const width = g.inputs[0] + (g.chain ? g.channels : 0), inputs = this.makeInputs(g, width, kind, rows), model = this.models[g.name + (g.refines ? "+" : "")];
-    const classes = Int32Array.from(rows, (i) => this.values.class[0][i]), kept = g.name !== "offsets";
-    for (let c = 0; c < g.channels; ++c) {
-      const to = this.values[g.name][c], column = this.columns[g.name][c], found = Int32Array.from(rows, (i) => to[i]), made = new Int16Array(rows.length);
-      readChannel(g, c, model, reader, inputs, width, 0, rows.length, classes, live?.[Math.floor(c / 3)], found, made, kept);
+    const model = this.models[g.name + (g.refines ? "+" : "")], { values, columns, parents } = this, n = rows.length;
+    const at = (column) => new Int16Array(n).map((_, j) => column[rows[j]]), fours = (from) => new Int32Array(4 * n).map((_, j) => from[4 * rows[j >> 2] + (j & 3)]);
+    const classes = new Int8Array(n).map((_, j) => (g.steps ? values.class[0][rows[j]] : 0)), inputs = kindInputs(g, kind, classes);
+    for (const name of g.own) for (const column of columns[name]) inputs.push(at(column));
+    if (g.parents) inputs.push(...this.coder.blend(columns[g.name], fours(parents.found), fours(parents.weights)));
+    if (g.refines) for (const column of columns[g.name]) inputs.push(at(column));
+    const found = values[g.name].map(() => new Int32Array(n)), made = g.chain ? found.map(() => new Int16Array(n)) : [];
+    this.coder.readRows(g, model, reader, inputs, classes, live, found, made);
+    if (g.name === "class") expectClasses(found[0]);
+    found.forEach((channel, c) => {
+      const there = live?.[Math.floor(c / 3)], to = values[g.name][c], column = columns[g.name][c];
       rows.forEach((i, j) => {
-        to[i] = found[j];
-        if (kept) column[i] = made[j];
+        if (!there || there[j]) to[i] = channel[j];
+        if (g.chain) column[i] = made[c][j];
       });
-      if (g.name === "class" && found.some((v) => v < LOW_CLASS || v >= LOW_CLASS + CLASSES)) fail("a step class out of range");
-    }
+    });
   }
 
   // Takes the next chunk.
@@ -144,7 +124,7 @@ export class LayeredScene {
     if (this.taken >= this.total || bytes.length < 4 || crc32(bytes.subarray(0, -4)) !== view.getUint32(bytes.length - 4, true)) fail("bytes with another checksum");
     const number = this.header.chunks[this.taken], reader = new Reader(bytes.subarray(0, -4)), rows = [[], []], { slots } = this.values;
     for (let i = Math.floor((number * N) / this.total); i < Math.floor(((number + 1) * N) / this.total); ++i) rows[this.isCoarse[i]].push(i);
-    const [added, coarse] = rows, masks = (list) => slots.map((slot) => Uint8Array.from(list, (i) => slot[i])), isOpen = !this.header.slots;
+    const [added, coarse] = rows, masks = (list) => slots.map((slot) => new Uint8Array(list.length).map((_, j) => slot[list[j]])), isOpen = !this.header.slots;
     const open = (list) => isOpen && slots.forEach((slot) => list.forEach((i) => (slot[i] = 1)));
     if (coarse.length) {
       const before = masks(coarse);

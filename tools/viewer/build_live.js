@@ -5,7 +5,7 @@ import { gzipSync } from "node:zlib";
 import { build } from "esbuild";
 
 const at = (name) => new URL(name, import.meta.url);
-const sources = [...readdirSync(at("live/")).sort().map((name) => `live/${name}`), "../../integrations/javascript/compact.mjs", "../../integrations/javascript/layers.mjs"];
+const sources = ["live/", "../../integrations/javascript/"].flatMap((folder) => readdirSync(at(folder)).sort().map((name) => folder + name));
 const sum = createHash("sha256");
 for (const name of sources) sum.update(readFileSync(at(name)));
 const checksum = sum.digest("hex");

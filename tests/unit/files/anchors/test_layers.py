@@ -87,11 +87,13 @@ def test_damaged_layers_are_refused(tmp_path):
 
 PROGRAM = f"""
 import {{ readFileSync, readdirSync }} from "node:fs";
+import {{ plain }} from {json.dumps((ROOT / "integrations/javascript/coder.mjs").as_uri())};
 import {{ readCompact }} from {json.dumps((ROOT / "integrations/javascript/compact.mjs").as_uri())};
 import {{ LayeredScene }} from {json.dumps((ROOT / "integrations/javascript/layers.mjs").as_uri())};
 const out = [], bytes = (path) => new Uint8Array(readFileSync(path));
-for (const folder of process.argv.slice(2)) {{
-  const scene = await LayeredScene.open(await readCompact(bytes(folder + "/coarse")), bytes(folder + "/plan"));
+for (const folder of process.argv.slice(3)) {{
+  const coder = process.argv[2] === "plain" ? plain : undefined;
+  const scene = await LayeredScene.open(await readCompact(bytes(folder + "/coarse"), coder), bytes(folder + "/plan"), coder);
   let counts = [scene.scene().header.N], said = "";
   for (let i = 0; i < scene.total; ++i) {{
     try {{ scene.take(bytes(folder + "/" + i)); }} catch (error) {{ said = error.message; break; }}
@@ -106,7 +108,8 @@ console.log(JSON.stringify(out));
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
-def test_the_reader_in_javascript_finds_the_same_numbers(tmp_path):
+@pytest.mark.parametrize("coder", ["plain", "compiled"])
+def test_the_reader_in_javascript_finds_the_same_numbers(tmp_path, coder):
     made = [make_layers(data) for data in scenes()]
     for i, one in enumerate([*made, made[0]]):
         (tmp_path / str(i)).mkdir()
@@ -114,7 +117,7 @@ def test_the_reader_in_javascript_finds_the_same_numbers(tmp_path):
             (tmp_path / str(i) / name).write_bytes(part if (i, name) != (len(made), "1") else part[:-5] + b"xx" + part[-3:])
     (tmp_path / "read.mjs").write_text(PROGRAM)
     folders = [str(tmp_path / str(i)) for i in range(len(made) + 1)]
-    done = subprocess.run(["node", str(tmp_path / "read.mjs"), *folders], capture_output=True, text=True, check=True)
+    done = subprocess.run(["node", str(tmp_path / "read.mjs"), coder, *folders], capture_output=True, text=True, check=True)
     *found, broken = json.loads(done.stdout)
     for one, (checksum, counts, said) in zip(made, found):
         scene = open_layers(tmp_path, one)

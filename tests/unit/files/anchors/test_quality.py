@@ -37,6 +37,14 @@ def test_the_search_ends_near_the_wanted_value(start):
 
 def test_steps_and_functions_without_a_place():
     assert search(lambda u: 5.0, 0.1, 0.0, 1.0, 0.85) is None
+
+
+def test_the_search_finds_a_place_where_the_function_hardly_changes():
+    value = lambda u: 80 + 2 ** (u / 4)  # noqa: E731
+    found = search(value, 80.1, 38.0, 0.12, 0.98, 0.0, 60.0)
+    assert found is None  # the least place has 81
+    found = search(value, 81.5, 38.0, 0.12, 0.9999, 0.0, 60.0)
+    assert found is not None and value(found) <= 81.5
     found = search(lambda u: 0.0 if u < -3 else 1.0, 0.5, 0.0, 1.0, 0.85)
     assert -4 < found < -3
     tried = []

@@ -1,8 +1,11 @@
-"""The reader in JavaScript decodes the same whole numbers: its checksum is that of the file and of the reader in Python."""
+"""The reader in JavaScript, plain and compiled, decodes the same whole numbers: its checksum is that of the file."""
 
+import importlib.util
 import json
+import random
 import shutil
 import subprocess
+import zlib
 
 import pytest
 import torch
@@ -12,14 +15,16 @@ from scene_experts.files.codec import container
 from support.compact import make_scene
 from support.places import ROOT
 
-READER = ROOT / "integrations" / "javascript" / "compact.mjs"
+READER = ROOT / "integrations" / "javascript"
 PROGRAM = f"""
 import {{ readFileSync }} from "node:fs";
-import {{ readCompact }} from {json.dumps(READER.as_uri())};
-const out = [];
-for (const path of process.argv.slice(2)) {{
+const [how, ...paths] = process.argv.slice(2), from = (name) => import({json.dumps(READER.as_uri())} + "/" + name);
+if (how === "without") globalThis.atob = () => {{ throw new Error("no module"); }};
+const {{ plain }} = await from("coder.mjs"), {{ loadCoder }} = await from("compiled.mjs"), {{ readCompact }} = await from("compact.mjs");
+const out = [(await loadCoder()) === plain];
+for (const path of paths) {{
   try {{
-    const scene = await readCompact(new Uint8Array(readFileSync(path)));
+    const scene = await readCompact(new Uint8Array(readFileSync(path)), how === "plain" ? plain : undefined);
     out.push([scene.checksum, [...scene.cells.slice(0, 3)], scene.groups.feature.map((c) => c[0])]);
   }} catch (error) {{
     out.push(String(error.message));
@@ -27,10 +32,18 @@ for (const path of process.argv.slice(2)) {{
 }}
 console.log(JSON.stringify(out));
 """
+pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
 
 
-@pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
-def test_the_reader_in_javascript_finds_the_same_numbers(tmp_path):
+def read(folder, how, paths):
+    (folder / "read.mjs").write_text(PROGRAM)
+    done = subprocess.run(["node", str(folder / "read.mjs"), how, *map(str, paths)], capture_output=True, text=True, check=True)
+    is_plain, *found = json.loads(done.stdout)
+    assert is_plain == (how == "without")
+    return found
+
+
+def write_scenes(folder):
     n = 120
     g = torch.Generator().manual_seed(5)
     level = torch.arange(n) % 2
@@ -39,23 +52,52 @@ def test_the_reader_in_javascript_finds_the_same_numbers(tmp_path):
         make_scene(n, slots=torch.rand(n, 4, generator=g) < 0.5, interval=torch.rand(n, generator=g) + 0.1),
         make_scene(n, level=level, extra_level=torch.rand(n, generator=g)),
     ]
-    paths = []
-    for i, scene in enumerate(scenes):
-        paths.append(tmp_path / f"{i}.compact")
-        compact.write(paths[-1], scene, {})
+    paths = [folder / f"{i}.compact" for i in range(len(scenes))]
+    for path, scene in zip(paths, scenes):
+        compact.write(path, scene, {})
+    return paths
+
+
+@pytest.mark.parametrize("how", ["compiled", "plain", "without"])
+def test_the_reader_in_javascript_finds_the_same_numbers(tmp_path, how):
+    paths = write_scenes(tmp_path)
     data = paths[0].read_bytes()
     paths.append(tmp_path / "damaged.compact")
     paths[-1].write_bytes(data[:100] + b"x" + data[101:])
-    (tmp_path / "read.mjs").write_text(PROGRAM)
-    done = subprocess.run(["node", str(tmp_path / "read.mjs"), *map(str, paths)], capture_output=True, text=True, check=True)
-    *found, broken = json.loads(done.stdout)
+    *found, broken = read(tmp_path, how, paths)
     for path, (checksum, cell, feature) in zip(paths, found):
         header, _ = container.part(path.read_bytes())
-        read = compact.read(path)
+        read_here = compact.read(path)
         assert checksum == header["integers"]
-        assert read.cells is None or read.cells[0].tolist() == cell
+        assert read_here.cells is None or read_here.cells[0].tolist() == cell
         steps = torch.tensor(header["steps"]["feature"], dtype=torch.float64)
-        ratio = read.columns["feature"][0].double() / steps / torch.tensor(feature, dtype=torch.float64)
+        ratio = read_here.columns["feature"][0].double() / steps / torch.tensor(feature, dtype=torch.float64)
         known = ratio[~ratio.isnan()]
         assert torch.allclose(known, known[:1].expand_as(known), rtol=1e-5)  # 2^class
     assert "checksum" in broken
+
+
+@pytest.mark.parametrize("how", ["compiled", "plain"])
+def test_streams_that_are_damaged_are_one_sentence(tmp_path, how):
+    """Behind a right checksum of the bytes, so that the coder meets them."""
+    chance, paths = random.Random(3), []
+    for path in write_scenes(tmp_path):
+        data = path.read_bytes()
+        begin = 12 + int.from_bytes(data[8:12], "little")
+        for _ in range(40):
+            broken = bytearray(data[:-4])
+            for at in chance.choices(range(begin, len(broken)), k=chance.choice((1, 4, 40))):
+                broken[at] = chance.randrange(256)
+            paths.append(tmp_path / f"broken{len(paths)}.compact")
+            paths[-1].write_bytes(bytes(broken) + zlib.crc32(broken).to_bytes(4, "little"))
+    said = read(tmp_path, how, paths)
+    assert all(isinstance(one, str) for one in said)  # never a scene of other numbers
+    assert sum(one.startswith("expected a compact file that this version reads, found") for one in said) > 100
+
+
+def test_the_compiled_reader_is_made_of_its_sources():
+    """`python tools/wasm/build.py` makes it."""
+    spec = importlib.util.spec_from_file_location("build_wasm", ROOT / "tools" / "wasm" / "build.py")
+    build = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(build)
+    assert build.FILE.read_text().splitlines()[1] == f"// {build.checksum()}", "build it: python tools/wasm/build.py"
