@@ -41,7 +41,7 @@ def write(path, case, **note):
 
 
 def go(page, pose):
-    page.tab.evaluate("pose => sceneExperts.setPose(pose)", pose)
+    page.tab.evaluate("pose => sceneExperts.page.setPose(pose)", pose)
     page.settle()
 
 
@@ -214,8 +214,8 @@ def test_the_page_moves_by_hands_keys_links_and_its_list(tmp_path):
     _, settings = write(tmp_path / "a.html", "scaffold-gs")
     with browsers(GL, WIDTH, HEIGHT) as make:
         page = make().open(tmp_path / "a.html")
-        tab, place = page.tab, lambda: np.array(page.tab.evaluate("sceneExperts.pose().position"))
-        turn = lambda: np.array(tab.evaluate("sceneExperts.pose().rotation"))  # noqa: E731
+        tab, place = page.tab, lambda: np.array(page.tab.evaluate("sceneExperts.page.pose().position"))
+        turn = lambda: np.array(tab.evaluate("sceneExperts.page.pose().rotation"))  # noqa: E731
         page.settle()
         first, rotation = place(), turn()
         np.testing.assert_allclose(first, settings["pose"]["position"], atol=1e-6)
@@ -242,7 +242,12 @@ def test_the_page_moves_by_hands_keys_links_and_its_list(tmp_path):
         np.testing.assert_allclose(place(), settings["poses"][2]["position"], atol=1e-6)
         tab.keyboard.press("l")
         assert "position=" in tab.evaluate("location.hash")
-        link = ",".join(map(str, first))
+        written = [float(v) for v in re.search("position=([^&]*)", tab.evaluate("location.hash"))[1].split(",")]
+        there = np.array(SEEN[2].pose["position"])  # of the capture, as are links and what a script gives and gets
+        np.testing.assert_allclose([written, tab.evaluate("sceneExperts.pose().position")], [there, there], atol=1e-5)
+        tab.evaluate("pose => sceneExperts.setPose(pose)", SEEN[1].pose)
+        np.testing.assert_allclose(place(), settings["poses"][1]["position"], atol=1e-6)
+        link = ",".join(map(str, first + settings["centre"]))
         tab.evaluate(f"location.hash = 'position={link}&rotation={','.join(map(str, rotation.ravel()))}&fov=50'")
         tab.wait_for_timeout(300)
         np.testing.assert_allclose(place(), first, atol=1e-6)
@@ -263,7 +268,7 @@ def test_the_first_view_is_that_of_the_screen(tmp_path):
     with browsers(GL, 640, 360) as make:
         page = make().open(tmp_path / "a.html")
         shown = lambda: page.tab.evaluate("[sceneExperts.page.shown, sceneExperts.page.veil.style.getPropertyValue('--edge')]")  # noqa: E731
-        place = lambda: page.tab.evaluate("sceneExperts.pose().position")  # noqa: E731
+        place = lambda: page.tab.evaluate("sceneExperts.page.pose().position")  # noqa: E731
 
         def turn(width, height):
             page.tab.set_viewport_size({"width": width, "height": height})

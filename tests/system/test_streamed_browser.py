@@ -110,10 +110,10 @@ def test_the_coarse_scene_is_shown_while_the_rest_is_late(tmp_path, monkeypatch,
         assert page.said == "" and "%" in page.tab.evaluate(LINE) and page.renderer == ("WebGPU" if flags is GPU else "WebGL 2")
         shown = page.picture(BACKGROUND)
         assert psnr(shown, picture(coarse)) > 45 and psnr(shown, picture(whole)) < 40
-        page.tab.evaluate("sceneExperts.setPose(sceneExperts.page.settings.poses[1])")  # one can move in it
+        page.tab.evaluate("sceneExperts.page.setPose(sceneExperts.page.settings.poses[1])")  # one can move in it
         rest(page)
         assert psnr(page.picture(BACKGROUND), shown) < 60
-        page.tab.evaluate("sceneExperts.setPose(sceneExperts.page.settings.poses[0])")
+        page.tab.evaluate("sceneExperts.page.setPose(sceneExperts.page.settings.poses[0])")
         held.remove("plan")
         page.tab.wait_for_function("sceneExperts.page.parts === 2")
         rest(page)

@@ -1,9 +1,11 @@
 // The page of `export --format html`: one scene, drawn by Spark (https://sparkjs.dev) on three.js, from data inside the page alone.
-// Poses are those of the capture: position and camera-to-world rotation (rows of 3x3; x right, y down, z forward).
+// Poses are position and camera-to-world rotation (rows of 3x3; x right, y down, z forward), in the capture's frame with another origin,
+// settings.centre. Links and scripts have those of the capture (live/link.js).
 // The scene is drawn in SPZ's frame (x right, y up, z back), half a turn about x from the capture's.
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { Color, Matrix4, PerspectiveCamera, Quaternion, Scene, SRGBColorSpace, Vector3, WebGLRenderer } from "three";
 import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
+import { fromCapture, readLink, toCapture, writeLink } from "./live/link.js";
 
 const FLIP = [1, -1, -1];
 const settings = JSON.parse(document.getElementById("settings").textContent);
@@ -144,7 +146,7 @@ class Page {
 
   whole() { document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.(); }
 
-  // A pose of the capture: {position, rotation, fov}; fov is the vertical field of view in degrees and may be left out.
+  // pose: {position, rotation, fov}; fov is the vertical field of view in degrees and may be left out.
   setPose(pose) {
     this.camera.position.set(...pose.position.map((v, i) => v * FLIP[i] * UNIT));
     this.camera.quaternion.setFromRotationMatrix(rotationMatrix(pose.rotation));
@@ -177,23 +179,11 @@ class Page {
   }
 
   readHash() {
-    const parts = new URLSearchParams(location.hash.slice(1));
-    const numbers = (name, count) => {
-      const found = (parts.get(name) ?? "").split(",").map(Number);
-      return found.length === count && found.every(Number.isFinite) ? found : null;
-    };
-    const [position, r, fov] = [numbers("position", 3), numbers("rotation", 9), numbers("fov", 1)];
-    // an absent field of view reads as 0
-    if (position && r) this.setPose({
-      position, rotation: [r.slice(0, 3), r.slice(3, 6), r.slice(6)], fov: fov?.[0] > 0 && fov[0] < 180 ? fov[0] : undefined,
-    });
+    const pose = readLink(location.hash);
+    if (pose) this.setPose(fromCapture(pose, settings.centre));
   }
 
-  writeHash() {
-    const { position, rotation, fov } = this.pose();
-    const text = (list) => list.map((v) => +v.toPrecision(7)).join(",");
-    history.replaceState(null, "", `#position=${text(position)}&rotation=${text(rotation.flat())}&fov=${+fov.toFixed(3)}`);
-  }
+  writeHash() { history.replaceState(null, "", writeLink(toCapture(this.pose(), settings.centre), settings.distance)); }
 
   resize() {
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
@@ -259,7 +249,7 @@ try {
   const page = new Page();
   page.loaded = page.load().catch((error) => { say(`The scene could not be shown: ${error.message}`); throw error; });
   window.sceneExperts = {
-    setPose: (pose) => page.setPose(pose), pose: () => page.pose(), settled: () => page.settled(), count: settings.count,
+    setPose: (pose) => page.setPose(fromCapture(pose, settings.centre)), pose: () => toCapture(page.pose(), settings.centre), settled: () => page.settled(), count: settings.count,
     frames: () => page.frames, page,
   };
 } catch (error) {

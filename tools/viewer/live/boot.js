@@ -1,5 +1,6 @@
 // Starts a program: on the page, and in the worker that the page starts.
 import { Page, say } from "./page.js";
+import { fromCapture, toCapture } from "./link.js";
 import { serve, start } from "./worker.js";
 
 const fail = (error) => {
@@ -16,7 +17,8 @@ export function boot(load, acts) {
     const page = new Page(settings, start(code));
     page.loaded = load(page).catch(fail);
     window.sceneExperts = {
-      setPose: (pose) => page.setPose(pose), pose: () => page.pose(), settled: () => page.settled(), count: settings.count, frames: () => page.frames, page,
+      setPose: (pose) => page.setPose(fromCapture(pose, settings.centre)), pose: () => toCapture(page.pose(), settings.centre),
+      settled: () => page.settled(), count: settings.count, frames: () => page.frames, page,
     };
   } catch (error) {
     fail(error);

@@ -2,6 +2,7 @@
 import { Camera, add, between, length, viewOf } from "./camera.js";
 import { listExperts, listPlaces, makePhotograph, show } from "./panels.js";
 import { openRenderer } from "./renderers.js";
+import { fromCapture, readLink, toCapture, writeLink } from "./link.js";
 
 const FLIGHT = 16; // seconds of a round
 const JUMP = 0.9; // seconds from one place to another
@@ -164,7 +165,7 @@ export class Page {
     this.wake();
   }
 
-  // A pose of the capture: {position, rotation, fov, aspect}; fov is vertical, in degrees, and it and the aspect may be left out.
+  // pose: {position, rotation, fov, aspect}, from settings.centre; fov is vertical, in degrees, and it and the aspect may be left out.
   setPose(pose) {
     this.flight = this.jump = null;
     this.place(pose);
@@ -194,19 +195,11 @@ export class Page {
   }
 
   readHash() {
-    const parts = new URLSearchParams(location.hash.slice(1));
-    const numbers = (name, count) => {
-      const found = (parts.get(name) ?? "").split(",").map(Number);
-      return found.length === count && found.every(Number.isFinite) ? found : null;
-    };
-    const [position, r, fov] = [numbers("position", 3), numbers("rotation", 9), numbers("fov", 1)]; // an absent field of view reads as 0
-    if (position && r) this.setPose({ position, rotation: [r.slice(0, 3), r.slice(3, 6), r.slice(6)], fov: fov?.[0] > 0 && fov[0] < 180 ? fov[0] : undefined });
+    const pose = readLink(location.hash);
+    if (pose) this.setPose(fromCapture(pose, this.settings.centre));
   }
 
-  writeHash() {
-    const { position, rotation, fov } = this.pose(), text = (list) => list.map((v) => +v.toPrecision(7)).join(",");
-    history.replaceState(null, "", `#position=${text(position)}&rotation=${text(rotation.flat())}&fov=${+fov.toFixed(3)}`);
-  }
+  writeHash() { history.replaceState(null, "", writeLink(toCapture(this.pose(), this.settings.centre), this.settings.distance)); }
 
   resize() {
     if (!this.canvas) return;
