@@ -4,7 +4,7 @@
 
 Writes the run's compact file, and prints the CPU seconds to fit its models, to code it with them and
 to decode it, and anchors per second: the least of several turns. Peer: zlib, level 9, of the file
-that holds the same scene as it is (--format anchors). Where there are Node and Chromium, they read
+that holds the same scene as it is (--format anchors). Where there are Node, and Chromium with playwright, they read
 the file by integrations/javascript too, compiled and plain: the first time in a new process or
 tab, and the least of several. Chromium's are seconds of the clock.
 """
@@ -12,6 +12,7 @@ tab, and the least of several. Chromium's are seconds of the clock.
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import shutil
 import subprocess
@@ -106,15 +107,14 @@ def in_chromium(file: Path, how: str) -> list[float]:
         (Path(folder) / "index.html").write_text(PAGE + PROGRAM + "</script>")
         server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=folder))
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        with sync_playwright() as p:
-            browser = p.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
-            tab = browser.new_page()
-            with tab.expect_console_message(lambda message: message.text.startswith("["), timeout=300_000) as said:
-                tab.goto(f"http://127.0.0.1:{server.server_port}/#{how}")
-            found = json.loads(said.value.text)
-            browser.close()
-        server.shutdown()
-        return found
+        try:
+            with sync_playwright() as p, p.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"]) as browser:
+                tab = browser.new_page()
+                with tab.expect_console_message(lambda message: message.text.startswith("["), timeout=300_000) as said:
+                    tab.goto(f"http://127.0.0.1:{server.server_port}/#{how}")
+                return json.loads(said.value.text)
+        finally:
+            server.shutdown()
 
 
 def main() -> None:
@@ -139,7 +139,8 @@ def main() -> None:
                 seconds.append(time.process_time() - began)
         rows["decode"] = min(seconds)
         for name, read in (("node", in_node), ("chromium", in_chromium)):
-            for how in ("compiled", "plain") if shutil.which(name) else ():
+            there = shutil.which(name) and (name == "node" or importlib.util.find_spec("playwright"))
+            for how in ("compiled", "plain") if there else ():
                 rows[f"{name}, {how}, first"], rows[f"{name}, {how}"] = read(Path(folder) / "scene.compact", how)
         packed = zlib.compress(plain, 9)
         rows["zlib, pack"], rows["zlib, unpack"] = least(lambda: zlib.compress(plain, 9)), least(lambda: zlib.decompress(packed))

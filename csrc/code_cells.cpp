@@ -72,9 +72,9 @@ const Sides& sides() {
   return tables;
 }
 
-// Walk the tree. `ask(level, share, key of the child)` codes one bit and returns it. False: more than `most` nodes.
-template <class Ask>
-bool walk(int depth, int64_t most, std::vector<uint64_t>* leaves, Ask&& ask) {
+// Walk the tree. `ask(level, share, key of the child)` codes one bit and returns it. False: more than `most` nodes, or `has_failed()`.
+template <class Ask, class Failed>
+bool walk(int depth, int64_t most, std::vector<uint64_t>* leaves, Ask&& ask, Failed&& has_failed) {
   const Sides& known = sides();
   std::vector<Count> counts(size_t{kDepths} * 8 * kStates);
   Nodes now, next;
@@ -109,7 +109,7 @@ bool walk(int depth, int64_t most, std::vector<uint64_t>* leaves, Ask&& ask) {
         }
       }
       now.children[i] = static_cast<uint8_t>(own);
-      if (static_cast<int64_t>(next.keys.size()) > most) return false;
+      if (static_cast<int64_t>(next.keys.size()) > most || has_failed()) return false;
     }
     if (level + 1 < depth) {
       next.beside.resize(6 * next.keys.size());
@@ -136,7 +136,7 @@ SE_EXPORT int64_t se_code_cells(const int64_t* keys, int64_t count, int32_t dept
     std::vector<uint64_t> leaves;
     int64_t at = 0;  // the first key that is not before the child
     int last = 0;
-    walk(depth, count, &leaves, [&](int level, uint32_t zeros, uint64_t key) {
+    const auto ask = [&](int level, uint32_t zeros, uint64_t key) {
       if (level != last) last = level, at = 0;
       const int shift = 3 * (depth - 1 - level);
       while (at < count && static_cast<uint64_t>(keys[at]) >> shift < key) ++at;
@@ -145,7 +145,8 @@ SE_EXPORT int64_t se_code_cells(const int64_t* keys, int64_t count, int32_t dept
         operations[written] = one ? se::code_operation(zeros, (1u << kCodeBits) - zeros) : se::code_operation(0, zeros);
       ++written;
       return one;
-    });
+    };
+    walk(depth, count, &leaves, ask, [] { return false; });
   });
   return status ? -1 : written;
 }
@@ -155,7 +156,8 @@ SE_EXPORT int32_t se_code_read_cells(SeCodeReader* reader, int32_t depth, int64_
   std::vector<uint64_t> leaves;
   bool whole = false;
   const int status = se::run_guarded([&] {
-    whole = walk(depth, count, &leaves, [&](int, uint32_t zeros, uint64_t) { return input.bit(zeros); });
+    const auto ask = [&](int, uint32_t zeros, uint64_t) { return input.bit(zeros); };
+    whole = walk(depth, count, &leaves, ask, [&] { return input.failed(); });
   });
   if (status) return status;
   reader->at = input.at();

@@ -32,6 +32,7 @@ struct Term {
 // The terms of a channel, filled up to a multiple of kTogether by terms of weight 0.
 std::vector<Term> find_terms(const int16_t** inputs, const int8_t* weights, int64_t D) {
   std::vector<Term> terms;
+  terms.reserve(static_cast<size_t>(D + kTogether));
   for (int64_t d = 0; d < D; ++d)
     if (weights[d] || weights[D + d]) terms.push_back({inputs[d], weights[d], weights[D + d]});
   while (terms.size() % kTogether) terms.push_back({inputs[0], 0, 0});

@@ -11,8 +11,11 @@
 import { loadCoder } from "./compiled.mjs";
 import { Reader, TOP, UNIT, fail, inflate } from "./coder.mjs";
 
+const MOST_ANCHORS = 2 ** 28, MOST_CHANNELS = 1024, MOST_SLOTS = 256, MOST_DEPTH = 21, FARTHEST_CELL = 2 ** 52, MOST_BITS = 63;
 const MANTISSA = 80, STEP = 24, MOST_INPUTS = 4096, MOST_FACTOR = 2 ** 20, MOST_NUMBER = 2 ** 28, MOST_WEIGHT = 127;
 export const LOW_CLASS = -2, CLASSES = 7, LEVELS = 3;
+
+const isWhole = (v, low, high) => Number.isInteger(v) && v >= low && v <= high;
 
 // ---- Places -----------------------------------------------------------------------------------------------------------------------------
 
@@ -43,6 +46,10 @@ export function pick(from, rows, Kind) {
 
 // Cells, lattices and fine cells of all anchors, along the curve. coder: what reads cells.
 export function readPlaces(header, reader, coder) {
+  const fits = header.lattices.every(([, , multiple, low, count, distinct, depth]) =>
+    isWhole(multiple, 1, 2 ** MOST_DEPTH) && low.length === 3 && low.every((v) => isWhole(v, -FARTHEST_CELL, FARTHEST_CELL)) &&
+    isWhole(count, 1, header.N) && isWhole(distinct, 1, count) && isWhole(depth, 0, MOST_DEPTH));
+  if (!isWhole(header.N, 0, MOST_ANCHORS) || !fits) fail("lattices with numbers out of range");
   const N = header.N;
   let own = new Float64Array(3 * N), lattice = new Uint8Array(N), wide = new Float64Array(3 * N), at = 0;
   header.lattices.forEach(([, , multiple, low, count, distinct, depth], number) => {
@@ -239,6 +246,10 @@ export async function open(bytes, mark, version) {
 export async function readCompact(bytes, coder) {
   coder ??= await loadCoder();
   const { header, parts } = await open(bytes, "SXCOMP2\n", 2);
+
+  const { F, K, boxes } = header;
+  if (!isWhole(F, 1, MOST_CHANNELS) || !isWhole(K, 1, MOST_SLOTS) || boxes.length !== 2 || !boxes.every((bits) => isWhole(bits, 0, MOST_BITS)))
+    fail("a header with numbers out of range");
 
   // the order: level by level, along the curve within a level
   const { own, lattice, fine } = readPlaces(header, new Reader(parts.positions), coder), N = header.N;

@@ -21,8 +21,13 @@ async function compile() {
 export async function loadCoder() {
   const module = await (made ??= compile());
   if (!module) return plain;
-  const { exports } = await WebAssembly.instantiate(module);
-  return new CompiledCoder(exports);
+  try {
+    const { exports } = await WebAssembly.instantiate(module);
+    exports._initialize();
+    return new CompiledCoder(exports);
+  } catch {
+    return plain; // no room for another memory
+  }
 }
 
 // Arrays in the memory of a module, made together and freed together, with what was taken since. Memory that grows moves: a view of it is good
@@ -68,7 +73,8 @@ class CompiledCoder {
       work(at);
     } catch (error) {
       block.free();
-      throw error instanceof WebAssembly.RuntimeError ? new Error("this compact file takes more memory than there is") : error;
+      const isFull = error instanceof WebAssembly.RuntimeError && /unreachable/i.test(error.message); // how the C++ stops there
+      throw isFull ? new Error("expected a compact file that memory has room for, found a larger one; close other pages", { cause: error }) : error;
     }
     view = new DataView(this.memory.buffer, at, READER);
     const [now, operations, ...state] = Array.from({ length: 6 }, (_, i) => Number(view.getBigInt64(2 * EIGHT + EIGHT * i, true)));
@@ -92,6 +98,7 @@ class CompiledCoder {
   }
 
   blend(columns, found, weights) {
+    if (!columns.length) return [];
     const C = columns.length, N = columns[0].length, n = found.length / 4, block = new Block(this, [2 * C * N, 16 * n, 16 * n, 2 * C * n]);
     if (!block.at) return plain.blend(columns, found, weights);
     columns.forEach((column, c) => block.view(Int16Array, 0, N, c * N).set(column));

@@ -11,7 +11,7 @@ import {
   CLASSES, LEVELS, bytesOf, compareMorton, crc32, expectClasses, findParents, kindInputs, makeGroups, open, pick, readModel, readPlaces,
 } from "./compact.mjs";
 import { loadCoder } from "./compiled.mjs";
-import { Reader, asInputs, clamp, fail } from "./coder.mjs";
+import { Reader, asInputs, clamp, fail, plain } from "./coder.mjs";
 
 const ADDED = 0, COARSE = 1; // which of the inputs for levels is set
 const MOST_CHUNKS = 64, AXIS = 2 ** 21, LARGEST = 2 ** 30;
@@ -104,7 +104,7 @@ export class LayeredScene {
     const at = (column) => new Int16Array(n).map((_, j) => column[rows[j]]), fours = (from) => new Int32Array(4 * n).map((_, j) => from[4 * rows[j >> 2] + (j & 3)]);
     const classes = new Int8Array(n).map((_, j) => (g.steps ? values.class[0][rows[j]] : 0)), inputs = kindInputs(g, kind, classes);
     for (const name of g.own) for (const column of columns[name]) inputs.push(at(column));
-    if (g.parents) inputs.push(...this.coder.blend(columns[g.name], fours(parents.found), fours(parents.weights)));
+    if (g.parents) inputs.push(...plain.blend(columns[g.name], fours(parents.found), fours(parents.weights)));
     if (g.refines) for (const column of columns[g.name]) inputs.push(at(column));
     const found = values[g.name].map(() => new Int32Array(n)), made = g.chain ? found.map(() => new Int16Array(n)) : [];
     this.coder.readRows(g, model, reader, inputs, classes, live, found, made);
@@ -141,6 +141,7 @@ export class LayeredScene {
     reader.finish();
     for (const i of [...coarse, ...added]) this.known[i] = 1;
     this.taken += 1;
+    if (this.taken === this.total) this.coder = null; // and its memory
     if (this.taken === this.total && this.checksum() !== this.header.integers) fail("numbers with another checksum");
   }
 

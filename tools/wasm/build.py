@@ -22,15 +22,27 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 FILE = ROOT / "integrations" / "javascript" / "codec.mjs"
 COMPILED = [ROOT / "csrc" / f"code{part}.cpp" for part in ("", "_cells", "_context", "_read")] + [Path(__file__).with_name("memory.cpp")]
-SOURCES = [*COMPILED, *(ROOT / "csrc" / name for name in ("code.h", "se_api.h", "status.h"))]
+SOURCES = [*COMPILED, ROOT / "csrc" / "code.h", ROOT / "csrc" / "status.h", Path(__file__)]
+INTERFACE, OURS = ROOT / "csrc" / "se_api.h", "// ---- Entropy coder"
 EXPORTS = ("take", "release", *(f"se_code_{name}" for name in ("read", "read_bits", "read_cells", "predict", "inputs", "blend")))
 TARGET = ("-target", "wasm32-wasi", "-mexec-model=reactor", "-msimd128", "-mbulk-memory")
-OPTIONS = ("-O3", "-std=c++20", "-fno-exceptions", "-fno-rtti", "-fno-threadsafe-statics", "-fvisibility=hidden", "-Wl,--strip-all")
+OPTIONS = (
+    "-O3",
+    "-std=c++20",
+    "-fno-exceptions",
+    "-fno-rtti",
+    "-fno-threadsafe-statics",
+    "-fvisibility=hidden",
+    "-Wl,--strip-all",
+    "-Wl,-z,stack-size=524288",
+)
 
 
 def checksum() -> str:
-    """The SHA-256 of the sources, without line ends of Windows."""
-    return hashlib.sha256(b"".join(path.read_bytes().replace(b"\r\n", b"\n") for path in SOURCES)).hexdigest()
+    """The SHA-256 of the sources, this one too, and of the coder's part of the C interface."""
+    texts = [path.read_text("utf-8") for path in SOURCES]
+    interface = INTERFACE.read_text("utf-8")
+    return hashlib.sha256("".join([*texts, interface[interface.index(OURS) :]]).encode()).hexdigest()
 
 
 def main() -> None:

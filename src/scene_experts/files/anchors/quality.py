@@ -145,7 +145,7 @@ def search(
     low: float | None = None
     high: float | None = None
     at = start
-    for round in range(ROUNDS):
+    for _ in range(ROUNDS):
         found = value(at)
         if found <= wanted:
             low = at if low is None else max(low, at)
@@ -156,10 +156,15 @@ def search(
         guess = at + max(-8.0, min(8.0, math.log2(max(0.5 * (1 + close) * wanted, 1e-12) / max(found, wanted / 64, 1e-12)) / slope))
         if low is not None and high is not None and not low + 0.1 * (high - low) < guess < high - 0.1 * (high - low):
             guess = 0.5 * (low + high)
-        guess = max(least, min(most, guess)) if low is not None or round < ROUNDS // 2 else least  # the slope was far away
+        guess = max(least, min(most, guess))
         if guess == at or (low is not None and high is not None and high - low < 0.02):
             break
         at = guess
+    if low is None and high is not None and high > least and value(least) <= wanted:  # the slope was far away
+        low = least
+        for _ in range(ROUNDS // 2):
+            at = 0.5 * (low + high)
+            low, high = (at, high) if value(at) <= wanted else (low, at)
     return low
 
 

@@ -37,6 +37,12 @@ def test_the_search_ends_near_the_wanted_value(start):
 
 def test_steps_and_functions_without_a_place():
     assert search(lambda u: 5.0, 0.1, 0.0, 1.0, 0.85) is None
+    found = search(lambda u: 0.0 if u < -3 else 1.0, 0.5, 0.0, 1.0, 0.85)
+    assert -4 < found < -3
+    tried = []
+    assert search(lambda u: tried.append(u) or 0.0, 0.5, -10.0, 1.0, 0.85) == quality.COARSEST and max(tried) == quality.COARSEST
+    assert search(lambda u: 2.0**u, 1e-30, -50.0, 1.0, 0.85) is None
+    assert math.isfinite(search(lambda u: -1.0, 0.5, 0.0, 1.0, 0.85))
 
 
 def test_the_search_finds_a_place_where_the_function_hardly_changes():
@@ -44,13 +50,13 @@ def test_the_search_finds_a_place_where_the_function_hardly_changes():
     found = search(value, 80.1, 38.0, 0.12, 0.98, 0.0, 60.0)
     assert found is None  # the least place has 81
     found = search(value, 81.5, 38.0, 0.12, 0.9999, 0.0, 60.0)
-    assert found is not None and value(found) <= 81.5
-    found = search(lambda u: 0.0 if u < -3 else 1.0, 0.5, 0.0, 1.0, 0.85)
-    assert -4 < found < -3
-    tried = []
-    assert search(lambda u: tried.append(u) or 0.0, 0.5, -10.0, 1.0, 0.85) == quality.COARSEST and max(tried) == quality.COARSEST
-    assert search(lambda u: 2.0**u, 1e-30, -50.0, 1.0, 0.85) is None
-    assert math.isfinite(search(lambda u: -1.0, 0.5, 0.0, 1.0, 0.85))
+    assert found is not None and 81.3 < value(found) <= 81.5
+
+
+@pytest.mark.parametrize("slope", [0.04, 0.05, 0.06])
+def test_the_search_comes_near_from_above(slope):
+    value = lambda u: 1.3 * 2 ** (slope * (u - 38))  # noqa: E731
+    assert 0.98 <= value(search(value, 1.0, 38.0, 0.12, 0.98, 0.0, 60.0)) <= 1
 
 
 @pytest.mark.slow

@@ -95,6 +95,31 @@ def test_streams_that_are_damaged_are_one_sentence(tmp_path, how):
     assert sum(one.startswith("expected a compact file that this version reads, found") for one in said) > 100
 
 
+def with_header(data, **changes):
+    """The file with another header. lattices: entries of the first one, by number."""
+    end = 12 + int.from_bytes(data[8:12], "little")
+    header = json.loads(zlib.decompress(data[12:end]))
+    for at, value in changes.pop("lattice", {}).items():
+        header["lattices"][0][at] = value
+    packed = zlib.compress(json.dumps({**header, **changes}).encode())
+    body = data[:8] + len(packed).to_bytes(4, "little") + packed + data[end:-4]
+    return body + zlib.crc32(body).to_bytes(4, "little")
+
+
+@pytest.mark.parametrize("how", ["compiled", "plain"])
+def test_headers_out_of_range_are_one_sentence(tmp_path, how):
+    data = write_scenes(tmp_path)[0].read_bytes()
+    changes = [{"lattice": {at: value}} for at, value in ((6, 22), (6, 10**6), (6, 1.5), (5, 1.5), (5, 10**8), (4, 0), (3, [0, 0]), (2, 0))]
+    changes += [{"lattice": {4: 10**8, 5: 10**8, 6: 21}, "N": 10**8}]  # read no further than the stream goes
+    changes += [{"N": -1}, {"N": 1e10}, {"F": 0}, {"K": 10**9}, {"boxes": [64, 0]}, {"boxes": [3]}]
+    paths = []
+    for i, change in enumerate(changes):
+        paths.append(tmp_path / f"{i}.changed")
+        paths[-1].write_bytes(with_header(data, **change))
+    said = read(tmp_path, how, paths)
+    assert all(isinstance(one, str) and "expected a compact file" in one for one in said), said
+
+
 def test_the_compiled_reader_is_made_of_its_sources():
     """`python tools/wasm/build.py` makes it."""
     spec = importlib.util.spec_from_file_location("build_wasm", ROOT / "tools" / "wasm" / "build.py")
