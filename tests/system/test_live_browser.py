@@ -3,6 +3,7 @@ rasteriser's, and it asks for nothing. Pictures are read from the page's own tex
 
 import io
 import json
+import math
 import re
 
 import numpy as np
@@ -247,10 +248,35 @@ def test_the_page_moves_by_hands_keys_links_and_its_list(tmp_path):
         np.testing.assert_allclose([written, tab.evaluate("sceneExperts.pose().position")], [there, there], atol=1e-5)
         tab.evaluate("pose => sceneExperts.setPose(pose)", SEEN[1].pose)
         np.testing.assert_allclose(place(), settings["poses"][1]["position"], atol=1e-6)
+        seen = tab.evaluate("[location.href, sceneExperts.page.shown, innerWidth / innerHeight]")
         link = ",".join(map(str, first + settings["centre"]))
         tab.evaluate(f"location.hash = 'position={link}&rotation={','.join(map(str, rotation.ravel()))}&fov=50'")
         tab.wait_for_timeout(300)
         np.testing.assert_allclose(place(), first, atol=1e-6)
+        tab.evaluate("location.hash = ''")  # back to an address without a view
+        tab.wait_for_timeout(1500)
+        page.settle()
+        np.testing.assert_allclose(place(), first, atol=1e-6)
+        for wrong in (
+            "{position: [NaN, 0, 0], rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}",
+            "{position: [0, 0, 0], rotation: Array(9).fill(0)}",
+            "",
+        ):
+            assert "expected a pose" in tab.evaluate(
+                f"(() => {{ try {{ sceneExperts.setPose({wrong}) }} catch (e) {{ return e.message }} }})()"
+            )
+        tab.evaluate("location.hash = 'position=,,&rotation=0,0,0,0,0,0,0,0,0'")
+        page.settle()
+        np.testing.assert_allclose(place(), first, atol=1e-6)
+        for size in ((WIDTH, HEIGHT), (HEIGHT, WIDTH), (3 * WIDTH, HEIGHT)):  # all of the sender's view, on a screen of any form
+            other = make()
+            other.tab.set_viewport_size({"width": size[0], "height": size[1]})
+            other.tab.goto(seen[0])
+            other.tab.wait_for_function("window.sceneExperts?.page.renderer")
+            shown, aspect = other.tab.evaluate("[sceneExperts.page.shown, innerWidth / innerHeight]")
+            tall, wide = (math.tan(math.radians(shown / 2)) / math.tan(math.radians(seen[1] / 2)) * k for k in (1, aspect / seen[2]))
+            assert min(tall, wide) == pytest.approx(1, abs=1e-3)
+            other.tab.close()
         tab.keyboard.press("h")
         assert tab.is_visible("#help") and not tab.is_visible("#list")
         tab.keyboard.press("Escape")

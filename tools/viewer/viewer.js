@@ -66,7 +66,7 @@ class Page {
     canvas.addEventListener("wheel", () => { this.held = false; this.wake(); }, { passive: true });
     canvas.addEventListener("webglcontextlost", () => say("The browser took the graphics away; load the page again"));
     addEventListener("resize", () => this.resize());
-    addEventListener("hashchange", () => this.readHash());
+    addEventListener("hashchange", (event) => this.readHash(event));
     addEventListener("keydown", (event) => this.press(event));
     addEventListener("keyup", (event) => this.keys.delete(event.code));
     addEventListener("blur", () => this.keys.clear());
@@ -151,7 +151,7 @@ class Page {
     this.camera.position.set(...pose.position.map((v, i) => v * FLIP[i] * UNIT));
     this.camera.quaternion.setFromRotationMatrix(rotationMatrix(pose.rotation));
     this.fov = pose.fov ?? settings.fov;
-    this.aspect = pose.aspect ?? this.aspect ?? settings.pose.aspect;
+    this.aspect = pose.aspect ?? (pose.whole ? undefined : settings.pose.aspect);
     this.fit();
     const ahead = new Vector3(0, 0, -1).applyQuaternion(this.camera.quaternion);
     this.controls.target.copy(this.camera.position).addScaledVector(ahead, settings.distance * UNIT);
@@ -178,12 +178,17 @@ class Page {
     return { position: this.camera.position.toArray().map((v, i) => (v * FLIP[i]) / UNIT), rotation, fov: this.fov };
   }
 
-  readHash() {
-    const pose = readLink(location.hash);
-    if (pose) this.setPose(fromCapture(pose, settings.centre));
+  // What the screen shows, as a pose.
+  seen() { return { ...this.pose(), fov: this.camera.fov, aspect: this.camera.aspect }; }
+
+  // event: of a change of the address, which leads to the first view where no view is in it.
+  readHash(event) {
+    const pose = readLink(location.hash, settings.centre);
+    if (pose) this.setPose(pose);
+    else if (event && !location.hash) this.home();
   }
 
-  writeHash() { history.replaceState(null, "", writeLink(toCapture(this.pose(), settings.centre), settings.distance)); }
+  writeHash() { history.replaceState(null, "", writeLink(this.seen(), settings.centre, settings.distance)); }
 
   resize() {
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
@@ -249,7 +254,7 @@ try {
   const page = new Page();
   page.loaded = page.load().catch((error) => { say(`The scene could not be shown: ${error.message}`); throw error; });
   window.sceneExperts = {
-    setPose: (pose) => page.setPose(fromCapture(pose, settings.centre)), pose: () => toCapture(page.pose(), settings.centre), settled: () => page.settled(), count: settings.count,
+    setPose: (pose) => page.setPose(fromCapture(pose, settings.centre)), pose: () => toCapture(page.seen(), settings.centre), settled: () => page.settled(), count: settings.count,
     frames: () => page.frames, page,
   };
 } catch (error) {

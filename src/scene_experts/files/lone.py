@@ -6,8 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from scene_experts.core.errors import InputError
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.source import guarding
@@ -46,8 +44,7 @@ def open_scene(path: Path, device: str = "cpu", step: int | None = None, data: P
     capture = None if data is None else run_folder.named(Data(data))
     with guarding(found, budget.HEAD, "scene"):
         read = family.read(found, capture, step)
-        with torch.random.fork_rng(devices=()):  # as in `run_folder.open_run`
-            scene = restore_foreign(read.cfg.scaled_scene(), read.tensors, {"step": read.step, **read.meta})
+        scene = restore_foreign(read.cfg.scaled_scene(), read.tensors, {"step": read.step, **read.meta})
     lone = Lone(found, name_of(path), read.capture if data is None else None, read.origin, carried_note(found))
     config = RunConfig(read.cfg, read.data, f"open {path.name}", versions=run_folder.versions())
     home = path if path.is_dir() else path.parent

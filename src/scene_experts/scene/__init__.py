@@ -312,7 +312,8 @@ def restore_scene(config: SceneConfig, tensors: dict[str, Tensor], meta: dict[st
     pick = lambda prefix: {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}  # noqa: E731
     if averaged:
         tensors = tensors | pick("average.")
-    scene = config.load(Table(pick("params."), pick("facts.")), meta)
+    with torch.random.fork_rng(devices=()):  # new networks draw their first weights; a training may be under way
+        scene = config.load(Table(pick("params."), pick("facts.")), meta)
     stored, wanted = pick("network."), scene.network_tensors()
     if stored.keys() != wanted.keys() or any(stored[k].shape != wanted[k].shape for k in wanted):
         raise InputError("expected the networks of this recipe in the checkpoint, found others; evaluate it with its own run folder")

@@ -297,8 +297,7 @@ def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun
     tensors, meta = newest(folder) if step is None else at_step(folder, step)
     with guarding(run, RUN):
         checkpoint.expect(meta, recipe=config.train.recipe)
-        with torch.random.fork_rng(devices=()):  # new networks draw their first weights; a training may be under way
-            scene = restore_foreign(config.train.scaled_scene(), tensors, meta, averaged=True)
+        scene = restore_foreign(config.train.scaled_scene(), tensors, meta, averaged=True)
         scene.exposures, scene.poses = Exposures.restore(tensors), Poses.restore(tensors)
         opened = OpenRun(run, config, scene, int(meta["step"]), Clock.of(meta), meta.get("capture", ""), meta.get("poses", ""))
     return replace(opened, scene=scene.to(device))

@@ -177,8 +177,7 @@ class Training:
         if self.averages is None:
             return self.scene
         own = {name: value.clone() for name, value in self.tensors().items() if name.startswith(("average.", "facts."))}
-        with torch.random.fork_rng(devices=()):  # new networks draw their first weights
-            return restore_scene(self.cfg.scene, own, self.meta(), averaged=True).to(self.scene.table.device)
+        return restore_scene(self.cfg.scene, own, self.meta(), averaged=True).to(self.scene.table.device)
 
     def rates(self) -> dict[str, float]:
         """Return the current learning rates by group."""

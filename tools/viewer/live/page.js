@@ -1,8 +1,8 @@
 // The page: one scene from data inside it alone, decoded and drawn here, and the hands that move through it.
 import { Camera, add, between, length, viewOf } from "./camera.js";
-import { listExperts, listPlaces, makePhotograph, show } from "./panels.js";
+import { fitPanels, listExperts, listPlaces, makePhotograph, show } from "./panels.js";
 import { openRenderer } from "./renderers.js";
-import { fromCapture, readLink, toCapture, writeLink } from "./link.js";
+import { readLink, writeLink } from "./link.js";
 
 const FLIGHT = 16; // seconds of a round
 const JUMP = 0.9; // seconds from one place to another
@@ -66,7 +66,7 @@ export class Page {
     on(main, "wheel", (event) => this.wheel(event), { passive: false });
     on(main, "contextmenu", (event) => event.target === this.canvas && event.preventDefault());
     on(window, "resize", () => this.resize());
-    on(window, "hashchange", () => this.readHash());
+    on(window, "hashchange", (event) => this.readHash(event));
     on(window, "keydown", (event) => this.press(event));
     on(window, "keyup", (event) => this.keys.delete(event.code));
     on(window, "blur", () => this.keys.clear());
@@ -161,7 +161,8 @@ export class Page {
     if (isCalm() || !this.renderer) return this.setPose(pose);
     this.flight = null;
     this.held = false;
-    this.jump = { from: { ...this.camera.pose(), fov: this.fov, aspect: this.aspect, fills: this.fills }, to: { ...pose, fov: pose.fov ?? this.settings.fov, fills: pose.fills ?? 0 }, part: 0 };
+    const now = this.whole ? this.seen() : { ...this.pose(), aspect: this.aspect };
+    this.jump = { from: { ...now, fills: this.fills }, to: { ...pose, fov: pose.fov ?? this.settings.fov, fills: pose.fills ?? 0 }, part: 0 };
     this.wake();
   }
 
@@ -177,31 +178,39 @@ export class Page {
   place(pose) {
     this.camera.set(pose);
     this.fov = pose.fov ?? this.settings.fov;
-    this.aspect = pose.aspect ?? this.aspect ?? this.settings.pose.aspect;
+    this.whole = pose.whole ?? false; // all of the pose's view is seen, whatever form the screen has
+    this.aspect = pose.aspect ?? (this.whole ? undefined : this.settings.pose.aspect);
     this.fills = pose.fills ?? 0;
     this.fit();
   }
 
   pose() { return { ...this.camera.pose(), fov: this.fov }; }
 
+  // What the screen shows, as a pose.
+  seen() { return { ...this.camera.pose(), fov: this.shown, aspect: innerWidth / innerHeight }; }
+
   // The field of view that this screen has: a wide screen is filled by the photograph, a narrow one shows about half more of its width, or
   // is filled too (`fills` 1).
   fit() {
-    const screen = innerWidth / innerHeight, ratio = this.aspect ? this.aspect / screen : 1, factor = ratio < 1 ? ratio : ratio ** (0.5 - 0.5 * this.fills);
+    const screen = innerWidth / innerHeight, ratio = this.aspect ? this.aspect / screen : 1;
+    const factor = this.whole ? Math.max(1, ratio) : ratio < 1 ? ratio : ratio ** (0.5 - 0.5 * this.fills);
     const tan = Math.tan((this.fov * Math.PI) / 360);
     this.shown = Math.min(WIDEST, (360 / Math.PI) * Math.atan(factor * tan));
     const share = tan / Math.tan((this.shown * Math.PI) / 360); // of the screen's height that the photograph has
     this.veil.style.setProperty("--edge", `${(50 * (1 - Math.min(1, share))).toFixed(2)}%`);
   }
 
-  readHash() {
-    const pose = readLink(location.hash);
-    if (pose) this.setPose(fromCapture(pose, this.settings.centre));
+  // event: of a change of the address, which leads to the first view where no view is in it.
+  readHash(event) {
+    const pose = readLink(location.hash, this.settings.centre);
+    if (pose) this.setPose(pose);
+    else if (event && !location.hash) this.home();
   }
 
-  writeHash() { history.replaceState(null, "", writeLink(toCapture(this.pose(), this.settings.centre), this.settings.distance)); }
+  writeHash() { history.replaceState(null, "", writeLink(this.seen(), this.settings.centre, this.settings.distance)); }
 
   resize() {
+    fitPanels();
     if (!this.canvas) return;
     const ratio = Math.min(devicePixelRatio, 2, LARGEST / Math.max(innerWidth, innerHeight));
     this.canvas.width = Math.max(1, Math.round(innerWidth * ratio));

@@ -8,14 +8,23 @@ const make = (name, properties, label) => {
 const PANEL = "position:fixed;left:10px;max-width:min(25rem,calc(100vw - 20px));max-height:40vh;overflow:auto;background:#1c1c1cf2;border-radius:8px;padding:8px;color:#fff";
 const PANELS = [["ask", "help"], ["places", "list"], ["parts", "experts"]]; // what opens what
 
+// Keeps the panels between the bar and the top of the window.
+export function fitPanels() {
+  const above = find("bar").offsetHeight + 20, room = Math.max(0, innerHeight - above - 10);
+  for (const [, name] of PANELS) {
+    const style = find(name)?.style;
+    if (style) Object.assign(style, { bottom: `${above}px`, maxHeight: `${name === "help" ? room : Math.min(room, 0.4 * innerHeight)}px`, boxSizing: "border-box" });
+  }
+}
+
 // Opens or closes the panel that a button controls; without `open`, the other one of the two.
 export function show(panel, open) {
-  const isOpen = open ?? find(panel)?.hidden, above = `${find("bar").offsetHeight + 20}px`;
+  const isOpen = open ?? find(panel)?.hidden;
+  fitPanels();
   for (const [by, name] of PANELS) {
     const one = find(name);
     if (!one) continue;
     one.hidden = !(isOpen && name === panel);
-    one.style.bottom = above;
     if (name !== "help") one.style.display = one.hidden ? "none" : "block";
     find(by).setAttribute("aria-expanded", String(!one.hidden));
   }
