@@ -51,6 +51,12 @@ _BYTES = """(array) => {
   for (let i = 0; i < bytes.length; i += 32768) text += String.fromCharCode(...bytes.subarray(i, i + 32768));
   return btoa(text);
 }"""
+TAP = """(() => {
+  const send = (type) => document.body.dispatchEvent(new KeyboardEvent(type, { code: "KeyW", bubbles: true }));
+  send("keydown");
+  for (const start = performance.now(); performance.now() - start < 300; );
+  send("keyup");
+})()"""  # a key that no frame sees held
 
 
 class LivePage:

@@ -15,7 +15,7 @@ from scene_experts.core.types import Mode
 from scene_experts.files.anchors import live
 from scene_experts.render import choose
 from scene_experts.view.paint import Look, paint
-from support.live_page import CHROMIUM, GL, GPU, browsers
+from support.live_page import CHROMIUM, GL, GPU, TAP, browsers
 from support.live_scenes import CASES, STEP, compare, contents_of, decoded, look, make_run, scene_in_page
 
 pytest.importorskip("playwright.sync_api")
@@ -232,6 +232,10 @@ def test_the_page_moves_by_hands_keys_links_and_its_list(tmp_path):
         tab.mouse.wheel(0, -300)
         page.settle()
         assert np.linalg.norm(place() - before) > 0.01
+        before = place()
+        tab.evaluate(TAP)
+        page.settle()
+        assert 0.9 < np.dot(place() - before, turn()[:, 2]) / (0.3 * settings["speed"]) < 2  # it flew ahead for as long as the key was held
         tab.keyboard.press("r")
         tab.wait_for_timeout(1500)
         page.settle()

@@ -5,6 +5,7 @@
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { Color, Matrix4, PerspectiveCamera, Quaternion, Scene, SRGBColorSpace, Vector3, WebGLRenderer } from "three";
 import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
+import { HeldKeys } from "./live/keys.js";
 import { fromCapture, readLink, toCapture, writeLink } from "./live/link.js";
 
 const FLIP = [1, -1, -1];
@@ -44,7 +45,7 @@ class Page {
     });
     this.scene.add(this.spark);
     this.places = settings.poses.map((pose) => new Vector3(...pose.position.map((v, i) => v * FLIP[i] * UNIT)));
-    this.keys = new Set();
+    this.keys = new HeldKeys();
     this.news = this.last = performance.now();
     this.held = true; // an exact pose, until somebody takes the camera
     this.frames = 0;
@@ -68,7 +69,7 @@ class Page {
     addEventListener("resize", () => this.resize());
     addEventListener("hashchange", (event) => this.readHash(event));
     addEventListener("keydown", (event) => this.press(event));
-    addEventListener("keyup", (event) => this.keys.delete(event.code));
+    addEventListener("keyup", (event) => this.keys.release(event));
     addEventListener("blur", () => this.keys.clear());
     const buttons = { home: () => this.home(), previous: () => this.step(-1), next: () => this.step(1), whole: () => this.whole(),
       ask: () => this.help(), close: () => this.help(), flight: () => this.fly_around() };
@@ -85,7 +86,7 @@ class Page {
     const act = { KeyR: () => this.home(), KeyF: () => this.whole(), BracketLeft: () => this.step(-1), BracketRight: () => this.step(1),
       KeyL: () => this.writeHash(), KeyH: () => this.help(), Escape: () => this.help(false), KeyP: () => this.fly_around() }[event.code];
     if (act) act();
-    else if (/^(Key[WASDQE]|Arrow)/.test(event.code)) { this.keys.add(event.code); this.flight = null; }
+    else if (this.keys.press(event)) this.flight = null;
     this.wake();
   }
 
@@ -196,13 +197,12 @@ class Page {
     this.fit();
   }
 
-  fly(seconds) {
-    const on = (...names) => (names.some((name) => this.keys.has(name)) ? 1 : 0);
-    const move = new Vector3(on("KeyD", "ArrowRight") - on("KeyA", "ArrowLeft"), on("KeyE") - on("KeyQ"),
-      on("KeyS", "ArrowDown") - on("KeyW", "ArrowUp"));
-    if (!move.lengthSq()) return false;
+  fly() {
+    const flown = this.keys.take();
+    if (!flown) return false;
+    const move = new Vector3(flown[0], flown[1], -flown[2]);
     this.held = false;
-    move.applyQuaternion(this.camera.quaternion).multiplyScalar(settings.speed * UNIT * seconds);
+    move.applyQuaternion(this.camera.quaternion).multiplyScalar(settings.speed * UNIT);
     this.camera.position.add(move);
     this.controls.target.add(move);
     return true;
@@ -220,7 +220,7 @@ class Page {
     const now = performance.now();
     const seconds = (now - this.last) / 1000;
     const target = this.controls.target.clone();
-    const flying = this.follow(Math.min(seconds, 0.1)) || this.fly(Math.min(seconds, 0.1));
+    const flown = this.fly(), flying = this.follow(Math.min(seconds, 0.1)) || flown;
     this.controls.dampingFactor = 1 - Math.exp(-8 * seconds); // by time, so that slow machines come to rest as soon
     this.last = now;
     veil.classList.toggle("on", this.held);

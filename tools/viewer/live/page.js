@@ -1,12 +1,12 @@
 // The page: one scene from data inside it alone, decoded and drawn here, and the hands that move through it.
 import { Camera, add, between, length, viewOf } from "./camera.js";
 import { fitPanels, listExperts, listPlaces, makePhotograph, show } from "./panels.js";
+import { HeldKeys } from "./keys.js";
 import { openRenderer } from "./renderers.js";
 import { readLink, writeLink } from "./link.js";
 
 const FLIGHT = 16; // seconds of a round
 const JUMP = 0.9; // seconds from one place to another
-const LONGEST = 0.5; // seconds of flying by keys that one frame carries out
 const REST = 250; // milliseconds without news until the picture is final
 const SLOW = 40, QUICK = 18, LEAST = 0.35; // milliseconds of a frame that lower and raise the resolution; its smallest share
 const WIDEST = 100; // degrees
@@ -19,7 +19,7 @@ const isCalm = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
 export class Page {
   // ask: of a worker, see worker.js.
   constructor(settings, ask) {
-    Object.assign(this, { settings, ask, keys: new Set(), hands: new Map(), flight: null, jump: null, held: true, scale: 1, frames: 0, index: settings.index });
+    Object.assign(this, { settings, ask, keys: new HeldKeys(), hands: new Map(), flight: null, jump: null, held: true, scale: 1, frames: 0, index: settings.index });
     this.camera = new Camera(settings.up, settings.distance);
     this.camera.still = isCalm();
     this.veil = find("veil");
@@ -68,7 +68,7 @@ export class Page {
     on(window, "resize", () => this.resize());
     on(window, "hashchange", (event) => this.readHash(event));
     on(window, "keydown", (event) => this.press(event));
-    on(window, "keyup", (event) => this.keys.delete(event.code));
+    on(window, "keyup", (event) => this.keys.release(event));
     on(window, "blur", () => this.keys.clear());
     this.near = find("near"); // whether the camera stays where photographs were taken
     on(this.near, "change", () => this.take());
@@ -128,7 +128,7 @@ export class Page {
     const act = { KeyR: () => this.home(), KeyF: () => this.whole(), BracketLeft: () => this.step(-1), BracketRight: () => this.step(1),
       KeyL: () => this.writeHash(), KeyH: () => show("help"), Escape: () => show("help", false), KeyP: () => this.flyAround() }[event.code];
     if (act) act();
-    else if (/^(Key[WASDQE]|Arrow)/.test(event.code) && !/^(INPUT|SECTION)$/.test(event.target.tagName)) (this.keys.add(event.code), this.take());
+    else if (!/^(INPUT|SECTION)$/.test(event.target.tagName) && this.keys.press(event)) this.take();
     this.wake();
   }
 
@@ -229,7 +229,7 @@ export class Page {
   // Moves the camera by what keys, hands, a flight or a jump ask for in some seconds: where it is depends on the clock, not on the number of
   // frames. Returns whether it moved.
   move(seconds) {
-    const { camera, settings, keys } = this, on = (...names) => (names.some((name) => keys.has(name)) ? 1 : 0);
+    const { camera, settings } = this, flown = this.keys.take();
     if (this.jump) {
       const { from, to } = this.jump, part = (this.jump.part = Math.min(1, this.jump.part + seconds / JUMP));
       if (part < 1) this.place(between(from, to, part * part * (3 - 2 * part)));
@@ -242,9 +242,8 @@ export class Page {
       this.held = true;
       return true;
     }
-    const fly = [on("KeyD", "ArrowRight") - on("KeyA", "ArrowLeft"), on("KeyQ") - on("KeyE"), on("KeyW", "ArrowUp") - on("KeyS", "ArrowDown")];
-    const flies = fly.some(Boolean), moved = camera.step(seconds);
-    if (flies) camera.fly(fly.map((v) => v * settings.speed * Math.min(seconds, LONGEST)));
+    const moved = camera.step(seconds), flies = flown !== null;
+    if (flies) camera.fly([flown[0], -flown[1], flown[2]].map((v) => v * settings.speed));
     if (moved || flies) this.stay(flies);
     return moved || flies;
   }

@@ -1,5 +1,7 @@
 """The page: one file that fetches nothing, starts where the note says, and shows in headless Chromium what our rasteriser draws."""
 
+import gzip
+import hashlib
 import io
 import json
 import math
@@ -23,6 +25,7 @@ from scene_experts.files.formats.splats import Splats
 from scene_experts.geometry.rotation import quat_to_matrix
 from scene_experts.geometry.sh import sh_to_rgb
 from scene_experts.render.reference import ReferenceRasterizer
+from support.live_page import TAP
 from support.messages import naming
 from support.splat_quanta import check, scene
 
@@ -161,9 +164,20 @@ def test_the_page_in_a_browser(tmp_path):
         page.keyboard.down("w")
         page.wait_for_timeout(400)
         page.keyboard.up("w")
-        assert psnr(shot(), dragged) < 40
+        flown = shot()
+        assert psnr(flown, dragged) < 40
+        page.evaluate(TAP)
+        assert psnr(shot(), flown) < 40
         assert page.title() == "<b>" and errors == [] and all(url.startswith(("file:", "blob:", "data:")) for url in requests)
         browser.close()
+
+
+def test_the_script_is_made_of_its_sources():
+    """`npm install && npm run build` in tools/viewer makes it."""
+    found = hashlib.sha256()
+    for name in ("live/keys.js", "live/link.js", "viewer.js", "build.js", "package.json"):
+        found.update((Path("tools/viewer") / name).read_bytes())
+    assert gzip.decompress((html.ASSETS / "viewer.min.js.gz").read_bytes()).startswith(f"// {found.hexdigest()}\n".encode())
 
 
 def test_the_scene_comes_back_out_of_the_page(tmp_path):
