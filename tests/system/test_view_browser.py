@@ -57,7 +57,8 @@ def test_the_page_shows_our_own_render_and_follows_the_controls(serving, browser
     assert picture[PART].std() > 5 and 10 * np.log10(255**2 / error) > 22
     serving.panel.show.value = "experts"
     page.wait_for_timeout(500)
-    assert np.abs(settled(page, serving)[PART].astype(int) - shot[PART]).mean() > 3
+    differs = lambda: np.abs(settled(page, serving)[PART].astype(int) - shot[PART]).mean() > 3  # noqa: E731
+    assert any(differs() for _ in range(5))  # on a busy machine the page is late
 
 
 def test_clients_come_and_go_and_nonsense_harms_nobody(serving, browser):
