@@ -7,6 +7,7 @@ import { Color, Matrix4, PerspectiveCamera, Quaternion, Scene, SRGBColorSpace, V
 import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 import { HeldKeys } from "./live/keys.js";
 import { fromCapture, readLink, toCapture, writeLink } from "./live/link.js";
+import { fullScreen, putHash, say, tell, watch } from "./live/screen.js";
 
 const FLIP = [1, -1, -1];
 const settings = JSON.parse(document.getElementById("settings").textContent);
@@ -14,10 +15,8 @@ const WIDEST = 100; // degrees, vertical field of view that a narrow screen (a p
 const FLIGHT = 16; // seconds of a round
 const QUIET = 400; // milliseconds of drawing after the last news
 const UNIT = 10 / settings.distance; // the renderer sorts anew when the camera moves by 0.001: scenes are drawn in lengths that suit it
-const note = document.getElementById("note");
 const veil = document.getElementById("veil"); // hides what lies above and below a photograph, until somebody takes the camera
 veil.style.setProperty("--back", `rgb(${settings.background.map((v) => Math.round(255 * v))})`);
-const say = (text) => { note.textContent = text; note.hidden = !text; };
 
 function bytesOf(id) {
   const text = document.getElementById(id).textContent;
@@ -71,20 +70,21 @@ class Page {
     addEventListener("keydown", (event) => this.press(event));
     addEventListener("keyup", (event) => this.keys.release(event));
     addEventListener("blur", () => this.keys.clear());
-    const buttons = { home: () => this.home(), previous: () => this.step(-1), next: () => this.step(1), whole: () => this.whole(),
-      ask: () => this.help(), close: () => this.help(), flight: () => this.fly_around() };
+    const buttons = { home: () => this.home(), previous: () => this.step(-1), next: () => this.step(1), whole: fullScreen,
+      ask: () => this.help(), close: () => this.help(), flight: () => this.flyAround() };
     this.near = document.getElementById("near"); // whether the camera stays where photographs were taken
     this.near.addEventListener("change", () => { this.held = false; this.wake(); });
     if (!settings.reach) this.near.parentElement.hidden = !(this.near.checked = false);
     for (const [name, act] of Object.entries(buttons)) document.getElementById(name).addEventListener("click", act);
     document.getElementById("flight").hidden = settings.flight.length < 2;
+    watch(document.getElementById("whole"));
     if (settings.poses.length < 2) document.getElementById("previous").hidden = document.getElementById("next").hidden = true;
   }
 
   press(event) {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    const act = { KeyR: () => this.home(), KeyF: () => this.whole(), BracketLeft: () => this.step(-1), BracketRight: () => this.step(1),
-      KeyL: () => this.writeHash(), KeyH: () => this.help(), Escape: () => this.help(false), KeyP: () => this.fly_around() }[event.code];
+    const act = { KeyR: () => this.home(), KeyF: fullScreen, BracketLeft: () => this.step(-1), BracketRight: () => this.step(1),
+      KeyL: () => this.writeHash(), KeyH: () => this.help(), Escape: () => this.help(false), KeyP: () => this.flyAround() }[event.code];
     if (act) act();
     else if (this.keys.press(event)) this.flight = null;
     this.wake();
@@ -99,7 +99,7 @@ class Page {
   }
 
   // Starts or stops the flight: a closed path that fits the capture, FLIGHT seconds a round.
-  fly_around() {
+  flyAround() {
     this.flight = this.flight === null && settings.flight.length > 1 ? 0 : null;
     this.wake();
   }
@@ -145,8 +145,6 @@ class Page {
     this.camera.lookAt(this.controls.target);
   }
 
-  whole() { document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.(); }
-
   // pose: {position, rotation, fov}; fov is the vertical field of view in degrees and may be left out.
   setPose(pose) {
     this.camera.position.set(...pose.position.map((v, i) => v * FLIP[i] * UNIT));
@@ -184,12 +182,13 @@ class Page {
 
   // event: of a change of the address, which leads to the first view where no view is in it.
   readHash(event) {
-    const pose = readLink(location.hash, settings.centre);
+    tell("");
+    const pose = readLink(location.hash, settings.centre, tell);
     if (pose) this.setPose(pose);
     else if (event && !location.hash) this.home();
   }
 
-  writeHash() { history.replaceState(null, "", writeLink(this.seen(), settings.centre, settings.distance)); }
+  writeHash() { putHash(writeLink(this.seen(), settings.centre, settings.distance)); }
 
   resize() {
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));

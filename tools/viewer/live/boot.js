@@ -1,6 +1,7 @@
 // Starts a program: on the page, and in the worker that the page starts.
-import { Page, say } from "./page.js";
+import { Page } from "./page.js";
 import { fromCapture, toCapture } from "./link.js";
+import { say } from "./screen.js";
 import { serve, start } from "./worker.js";
 
 const fail = (error) => {

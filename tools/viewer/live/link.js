@@ -21,15 +21,15 @@ export function fromCapture(pose, centre) {
 }
 export const toCapture = (pose, centre) => ({ ...pose, position: pose.position.map((v, i) => v + centre[i]) });
 
-// The pose of the page in the hash of an address, or null. A field of view or aspect that is none is left out.
-export function readLink(hash, centre) {
+// The pose of the page in the hash of an address, or null; a view that is no pose is told. A field of view or aspect that is none is left out.
+export function readLink(hash, centre, tell) {
   const parts = new URLSearchParams(hash.slice(1)), numbers = (name) => (parts.get(name) ?? "").split(",").map((v) => (v.trim() ? Number(v) : NaN));
   if (!parts.has("position")) return null;
   const [position, rotation, [fov], [aspect]] = ["position", "rotation", "fov", "aspect"].map(numbers);
   try {
     return fromCapture({ position, rotation, fov: isNumber(fov, 0, 180) ? fov : undefined, aspect: isNumber(aspect, 0, Infinity) ? aspect : undefined }, centre);
   } catch (error) {
-    console.warn(`The link has no view of this scene: ${error.message}`);
+    tell(`The link has no view of this scene: ${error.message}`);
     return null;
   }
 }

@@ -4,6 +4,7 @@ import { fitPanels, listExperts, listPlaces, makePhotograph, show } from "./pane
 import { HeldKeys } from "./keys.js";
 import { openRenderer } from "./renderers.js";
 import { readLink, writeLink } from "./link.js";
+import { fullScreen, putHash, say, tell, watch } from "./screen.js";
 
 const FLIGHT = 16; // seconds of a round
 const JUMP = 0.9; // seconds from one place to another
@@ -13,7 +14,6 @@ const WIDEST = 100; // degrees
 const LARGEST = 4096; // pixels of a side of the picture
 
 const find = (id) => document.getElementById(id);
-export const say = (text) => ((find("note").textContent = text), (find("note").hidden = !text));
 const isCalm = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
 
 export class Page {
@@ -73,11 +73,12 @@ export class Page {
     this.near = find("near"); // whether the camera stays where photographs were taken
     on(this.near, "change", () => this.take());
     if (!this.settings.reach) this.near.parentElement.hidden = !(this.near.checked = false);
-    const acts = { home: () => this.home(), previous: () => this.step(-1), next: () => this.step(1), whole: () => this.whole(),
+    const acts = { home: () => this.home(), previous: () => this.step(-1), next: () => this.step(1), whole: fullScreen,
       ask: () => show("help"), close: () => show("help"), flight: () => this.flyAround() };
     for (const [name, act] of Object.entries(acts)) on(find(name), "click", act);
     if (this.settings.experts) listExperts(this.settings.experts, (look) => ((this.look = look), this.wake()));
     find("flight").hidden = this.settings.flight.length < 2;
+    watch(find("whole"));
     if (this.settings.poses.some((pose) => pose.picture)) this.photograph = makePhotograph(this);
     if (this.settings.poses.length < 2) return void (find("previous").hidden = find("next").hidden = true);
     listPlaces(this.settings.poses, (i) => ((this.index = i), this.flyTo(this.settings.poses[i])));
@@ -125,7 +126,7 @@ export class Page {
 
   press(event) {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    const act = { KeyR: () => this.home(), KeyF: () => this.whole(), BracketLeft: () => this.step(-1), BracketRight: () => this.step(1),
+    const act = { KeyR: () => this.home(), KeyF: fullScreen, BracketLeft: () => this.step(-1), BracketRight: () => this.step(1),
       KeyL: () => this.writeHash(), KeyH: () => show("help"), Escape: () => show("help", false), KeyP: () => this.flyAround() }[event.code];
     if (act) act();
     else if (!/^(INPUT|SECTION)$/.test(event.target.tagName) && this.keys.press(event)) this.take();
@@ -146,8 +147,6 @@ export class Page {
     this.index = (this.index + by + n) % n;
     this.flyTo(this.settings.poses[this.index]);
   }
-
-  whole() { document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.(); }
 
   flyAround() {
     this.flight = this.flight === null && this.settings.flight.length > 1 ? 0 : null;
@@ -202,12 +201,13 @@ export class Page {
 
   // event: of a change of the address, which leads to the first view where no view is in it.
   readHash(event) {
-    const pose = readLink(location.hash, this.settings.centre);
+    tell("");
+    const pose = readLink(location.hash, this.settings.centre, tell);
     if (pose) this.setPose(pose);
     else if (event && !location.hash) this.home();
   }
 
-  writeHash() { history.replaceState(null, "", writeLink(this.seen(), this.settings.centre, this.settings.distance)); }
+  writeHash() { putHash(writeLink(this.seen(), this.settings.centre, this.settings.distance)); }
 
   resize() {
     fitPanels();

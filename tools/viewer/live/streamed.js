@@ -2,7 +2,7 @@
 import { readCompact } from "../../../integrations/javascript/compact.mjs";
 import { LayeredScene, expectPart, foreignPart } from "../../../integrations/javascript/layers.mjs";
 import { boot } from "./boot.js";
-import { say } from "./page.js";
+import { say } from "./screen.js";
 import { sceneOf } from "./worker.js";
 
 const STALL = 30_000; // milliseconds without a byte until a part counts as missing

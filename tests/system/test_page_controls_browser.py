@@ -1,0 +1,106 @@
+"""Every control of both kinds of exported page, in headless Chromium: buttons, keys, full screen, links, and a page inside a frame."""
+
+import html as text
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from scene_experts.files.anchors import live
+from scene_experts.files.formats import html
+from support.live_page import CHROMIUM, GL, browsers
+from support.live_scenes import contents_of, look, make_run
+from support.splat_quanta import scene
+
+pytest.importorskip("playwright.sync_api")
+pytestmark = [pytest.mark.slow, pytest.mark.foreign, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")]
+WIDTH, HEIGHT = 480, 240
+BROKEN = "#position=,,&rotation=0,0,0,0,0,0,0,0,0"
+READY = "window.sceneExperts?.page.renderer && document.getElementById('note').hidden"
+SAID = "document.getElementById('note').hidden ? '' : document.getElementById('note').textContent"
+
+
+def write(path, kind):
+    """A page with three places of photographs and a flight."""
+    places = [look(place, width=WIDTH, height=HEIGHT).pose for place in ((0.3, -0.4, -1.0), (2.5, 0.5, 0.0), (-2.0, 0.3, 1.0))]
+    note = {"cameras": places, "flight": places}
+    if kind == "live":
+        live.write(path, contents_of(make_run("scaffold-gs")), {**note, "nearest": 0.01})
+    else:
+        html.write(path, scene(100, 1), note)
+    return path
+
+
+@pytest.fixture(params=["live", "baked"])
+def page(request, tmp_path):
+    """An open page that has drawn its scene, and its path."""
+    path = write(tmp_path / "a.html", request.param)
+    with browsers(GL, WIDTH, HEIGHT) as make:
+        made = make().open(path)
+        made.tab.wait_for_function(READY)
+        made.tab.set_default_timeout(60_000)
+        yield made, path
+
+
+def test_each_button_and_key_acts_without_an_error(page):
+    made, _ = page
+    tab = made.tab
+    shown = tab.evaluate("[...document.querySelectorAll('#bar button')].filter((b) => !b.hidden).map((b) => b.id)")
+    assert {"home", "previous", "next", "flight", "whole", "ask"} <= set(shown)
+    for _ in range(2):  # the second time takes back what the first did
+        for name in shown:
+            tab.click(f"#{name}")
+    for key in ("r", "[", "]", "p", "p", "h", "Escape", "w", "q", "ArrowLeft", "l"):
+        tab.keyboard.press(key)
+    assert "position=" in tab.evaluate("location.hash") and made.errors == []
+
+
+def test_full_screen_comes_and_goes(page):
+    made, _ = page
+    tab = made.tab
+    for act in (lambda: tab.click("#whole"), lambda: tab.keyboard.press("f")):
+        act()
+        tab.wait_for_function("document.fullscreenElement !== null")
+        act()
+        tab.wait_for_function("document.fullscreenElement === null")
+    assert made.errors == []
+
+
+def test_a_link_without_a_view_is_told_until_somebody_acts(page):
+    made, path = page
+    tab = made.tab
+    before = tab.evaluate("sceneExperts.pose().position")
+    for start in (lambda: tab.evaluate(f"location.hash = '{BROKEN}'"), lambda: (tab.goto("about:blank"), tab.goto(path.as_uri() + BROKEN))):
+        start()
+        tab.wait_for_function(
+            f"window.sceneExperts?.page.renderer && ({SAID}).startsWith('The link has no view of this scene: expected a pose')"
+        )
+        tab.evaluate("sceneExperts.settled()")
+        np.testing.assert_allclose(tab.evaluate("sceneExperts.pose().position"), before, atol=1e-6)
+        assert "The link has no view" in made.said
+        tab.keyboard.press("]")
+        assert made.said == "" and made.errors == []
+
+
+@pytest.mark.parametrize("allowed", [True, False])
+def test_a_page_that_is_the_text_of_a_frame(page, tmp_path, allowed):
+    """As notebooks show it: key L writes into the frame's own address, and full screen has a button where the outer page allows it."""
+    made, path = page
+    outer = tmp_path / "outer.html"
+    allow = "*" if allowed else "'none'"
+    outer.write_text(
+        f'<iframe style="width:95vw;height:90vh" allow="fullscreen {allow}" srcdoc="{text.escape(path.read_text("utf8"))}"></iframe>',
+        "utf8",
+    )
+    made.tab.goto(outer.as_uri())
+    frame = made.tab.frames[1]
+    frame.wait_for_function(READY)
+    frame.evaluate("sceneExperts.settled()")
+    assert np.asarray(Image.open(io.BytesIO(made.tab.screenshot())).convert("L")).std() > 5
+    assert frame.is_visible("#whole") == allowed
+    frame.click("#next")
+    made.tab.keyboard.press("l")
+    made.tab.keyboard.press("f")
+    frame.wait_for_function("location.hash.startsWith('#position=')")
+    assert frame.evaluate("document.fullscreenElement !== null") == allowed and made.errors == []
