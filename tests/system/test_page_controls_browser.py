@@ -104,3 +104,16 @@ def test_a_page_that_is_the_text_of_a_frame(page, tmp_path, allowed):
     made.tab.keyboard.press("f")
     frame.wait_for_function("location.hash.startsWith('#position=')")
     assert frame.evaluate("document.fullscreenElement !== null") == allowed and made.errors == []
+
+
+def test_the_bar_and_the_help_fit_a_phone(page):
+    made, _ = page
+    tab = made.tab
+    tab.set_viewport_size({"width": 300, "height": 500})
+    tab.click("#ask")
+    box = "(e) => { const r = e.getBoundingClientRect(); return [r.left, r.top, r.right, r.bottom]; }"
+    buttons = tab.evaluate(f"[...document.querySelectorAll('#bar button')].filter((b) => !b.hidden).map({box})")
+    left, top, right, bottom = tab.evaluate(f"({box})(document.getElementById('help'))")
+    assert left >= 0 and right <= 300 and top >= 0 and bottom <= min(b[1] for b in buttons)
+    assert all(b[0] >= 0 and b[2] <= 300 and b[3] <= 500 for b in buttons)
+    assert max(b[3] - b[1] for b in buttons) < 1.5 * min(b[3] - b[1] for b in buttons)  # no text in two lines

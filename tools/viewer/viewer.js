@@ -7,6 +7,7 @@ import { Color, Matrix4, PerspectiveCamera, Quaternion, Scene, SRGBColorSpace, V
 import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 import { HeldKeys } from "./live/keys.js";
 import { fromCapture, readLink, toCapture, writeLink } from "./live/link.js";
+import { fitPanels, show } from "./live/panels.js";
 import { fullScreen, putHash, say, tell, watch } from "./live/screen.js";
 
 const FLIP = [1, -1, -1];
@@ -71,7 +72,7 @@ class Page {
     addEventListener("keyup", (event) => this.keys.release(event));
     addEventListener("blur", () => this.keys.clear());
     const buttons = { home: () => this.home(), previous: () => this.step(-1), next: () => this.step(1), whole: fullScreen,
-      ask: () => this.help(), close: () => this.help(), flight: () => this.flyAround() };
+      ask: () => show("help"), close: () => show("help"), flight: () => this.flyAround() };
     this.near = document.getElementById("near"); // whether the camera stays where photographs were taken
     this.near.addEventListener("change", () => { this.held = false; this.wake(); });
     if (!settings.reach) this.near.parentElement.hidden = !(this.near.checked = false);
@@ -84,7 +85,7 @@ class Page {
   press(event) {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     const act = { KeyR: () => this.home(), KeyF: fullScreen, BracketLeft: () => this.step(-1), BracketRight: () => this.step(1),
-      KeyL: () => this.writeHash(), KeyH: () => this.help(), Escape: () => this.help(false), KeyP: () => this.flyAround() }[event.code];
+      KeyL: () => this.writeHash(), KeyH: () => show("help"), Escape: () => show("help", false), KeyP: () => this.flyAround() }[event.code];
     if (act) act();
     else if (this.keys.press(event)) this.flight = null;
     this.wake();
@@ -120,13 +121,6 @@ class Page {
     const ahead = new Vector3(0, 0, -1).applyQuaternion(this.camera.quaternion);
     this.controls.target.copy(this.camera.position).addScaledVector(ahead, settings.distance * UNIT);
     return true;
-  }
-
-  // Shows or hides the help; without an argument, the other one of the two.
-  help(open) {
-    const panel = document.getElementById("help");
-    panel.hidden = !(open ?? panel.hidden);
-    document.getElementById("ask").setAttribute("aria-expanded", String(!panel.hidden));
   }
 
   // Moves a camera that left the photographs to the nearest point within reach of one. A target that moved with it moves back too.
@@ -191,6 +185,7 @@ class Page {
   writeHash() { putHash(writeLink(this.seen(), settings.centre, settings.distance)); }
 
   resize() {
+    fitPanels();
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.renderer.setSize(innerWidth, innerHeight);
     this.fit();

@@ -26,7 +26,7 @@ export function show(panel, open) {
     if (!one) continue;
     one.hidden = !(isOpen && name === panel);
     if (name !== "help") one.style.display = one.hidden ? "none" : "block";
-    find(by).setAttribute("aria-expanded", String(!one.hidden));
+    find(by)?.setAttribute("aria-expanded", String(!one.hidden));
   }
 }
 
@@ -38,7 +38,6 @@ function addPanel(after, id, text, title, panel, label) {
   section.style.cssText = `${PANEL};display:none`;
   button.addEventListener("click", () => show(panel));
   find(after).after(button);
-  find("bar").style.flexWrap = "wrap";
   find("bar").after(section);
   return section;
 }

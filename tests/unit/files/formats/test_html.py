@@ -175,7 +175,7 @@ def test_the_page_in_a_browser(tmp_path):
 def test_the_script_is_made_of_its_sources():
     """`npm install && npm run build` in tools/viewer makes it."""
     found = hashlib.sha256()
-    for name in ("live/keys.js", "live/link.js", "live/screen.js", "viewer.js", "build.js", "package.json"):
+    for name in ("live/keys.js", "live/link.js", "live/panels.js", "live/screen.js", "viewer.js", "build.js", "package.json"):
         found.update((Path("tools/viewer") / name).read_bytes())
     assert gzip.decompress((html.ASSETS / "viewer.min.js.gz").read_bytes()).startswith(f"// {found.hexdigest()}\n".encode())
 
