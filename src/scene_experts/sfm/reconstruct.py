@@ -82,6 +82,8 @@ def reconstruct(
         check_request(source, out, overwrite)  # again: results of a killed process may just have been published
         own = source.resolve() == (out / "images").resolve()
         images = out / "images" if own else folder / work.DONE / "images"
+        if own:
+            work.remove(folder / work.DONE)  # what an earlier call copied there would replace them
         place = source
         if source.is_file():
             found, place = take_frames(source, folder, images, options, say, progress)

@@ -221,6 +221,19 @@ def test_the_own_images_of_a_capture_are_not_modified(tmp_path, monkeypatch):
         make(write_black(tmp_path.parent / "elsewhere"), tmp_path, overwrite=True)
 
 
+def test_copies_of_an_earlier_call_do_not_replace_the_own_images(tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    monkeypatch.setattr(run, "run_worker", fake_worker())
+    with pytest.raises(InputError, match="none that fit together"):
+        make(write_black(tmp_path / "photos"), out)
+    assert (out / NAME / "done" / "images").is_dir()
+    images = write_black(out / "images", 4)
+    before = {path.name: path.read_bytes() for path in images.iterdir()}
+    monkeypatch.setattr(run, "run_worker", fake_worker(**FOUND))
+    assert not make(images, out)["copied"]
+    assert {path.name: path.read_bytes() for path in images.iterdir()} == before
+
+
 def test_files_of_the_user_are_not_replaced(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "run_worker", fake_worker(**FOUND))
     out = tmp_path / "out"
