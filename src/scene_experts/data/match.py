@@ -119,15 +119,18 @@ class NameIndex:
     def __init__(self, names: Iterable[str]) -> None:
         self._exact: dict[str, str] = {}
         self._keys: dict[str, set[str]] = defaultdict(set)
+        folders = set()
         for name in names:
             pure = PurePosixPath(_plain(name))
+            folders.add(pure.parent)
             self._exact[str(pure)] = name
             for key in {str(pure), str(pure.with_suffix("")), pure.name, pure.stem}:
                 self._keys[key].add(name)
+        self._flat = len(folders) == 1
 
     def find(self, written: str) -> set[str]:
-        """Return the names that `written` may stand for: by path, by a path without its first
-        folder or with another or no extension, or by a base name.
+        """Return the names that `written` may stand for: by path, by the end of one with another or
+        no extension, or by a base name. A folder may differ only where all names are in one folder.
 
         The set has one name if `written` is unambiguous, and none if it is unknown.
         """
@@ -136,8 +139,14 @@ class NameIndex:
             return {self._exact[str(pure)]}
         bare = pure.with_suffix("") if pure.suffix.lower() in EXTENSIONS else pure
         tries = [str(each) for path in (pure, bare) for each in (path, PurePosixPath(*path.parts[1:]), path.name)]
-        groups = [self._keys[key] for key in tries if key in self._keys]
+        groups = [group for key in tries if (group := {name for name in self._keys.get(key, ()) if self._may_be(name, pure)})]
         return next((group for group in groups if len(group) == 1), groups[0] if groups else set())
+
+    def _may_be(self, name: str, path: PurePosixPath) -> bool:
+        """Return whether the folders of a name do not contradict those of a path."""
+        own, others = PurePosixPath(_plain(name)).parent.parts, path.parent.parts
+        shared = min(len(own), len(others))
+        return self._flat or not shared or own[-shared:] == others[-shared:]
 
 
 def _plain(name: str) -> str:

@@ -95,6 +95,15 @@ def test_names_as_people_write_them() -> None:
     assert index.find("three") == index.find("") == set()
 
 
+def test_a_photograph_of_another_folder_is_another_one() -> None:
+    index = NameIndex(["images/cam1/0001.jpg", "images/cam1/0002.jpg", "images/cam2/0002.jpg"])
+    assert index.find("cam1/0002.jpg") == index.find("cam1/0002") == {"images/cam1/0002.jpg"}
+    assert index.find("0001.png") == index.find("/data/images/cam1/0001.jpg") == {"images/cam1/0001.jpg"}
+    assert index.find("cam2/0001.jpg") == index.find("images/cam2/0001") == set()
+    flat = NameIndex(["images/0001.jpg", "images/0002.jpg"])
+    assert flat.find("cam/0001.jpg") == flat.find("images_4/0001.png") == {"images/0001.jpg"}
+
+
 def test_an_absent_image_is_reported(tmp_path: Path) -> None:
     match = match_images(tmp_path / "none", ["a.jpg"])
     assert match.absent == ("a.jpg",)
