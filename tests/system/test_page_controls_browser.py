@@ -2,6 +2,7 @@
 
 import html as text
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,14 +22,15 @@ READY = "window.sceneExperts?.page.renderer && document.getElementById('note').h
 SAID = "document.getElementById('note').hidden ? '' : document.getElementById('note').textContent"
 
 
-def write(path, kind):
-    """A page with three places of photographs and a flight."""
+def write(path, kind, origin=None):
+    """A page with three places of photographs and a flight. origin: Of its file in the capture's frame."""
     places = [look(place, width=WIDTH, height=HEIGHT).pose for place in ((0.3, -0.4, -1.0), (2.5, 0.5, 0.0), (-2.0, 0.3, 1.0))]
-    note = {"cameras": places, "flight": places}
+    note, about = {"cameras": places, "flight": places}, {} if origin is None else {"origin": list(origin)}
     if kind == "live":
-        live.write(path, contents_of(make_run("scaffold-gs")), {**note, "nearest": 0.01})
+        data = contents_of(make_run("scaffold-gs"))
+        live.write(path, replace(data, about={**data.about, **about}), {**note, "nearest": 0.01})
     else:
-        html.write(path, scene(100, 1), note)
+        html.write(path, scene(100, 1), note | about)
     return path
 
 
@@ -81,6 +83,35 @@ def test_a_link_without_a_view_is_told_until_somebody_acts(page):
         assert "The link has no view" in made.said
         tab.keyboard.press("]")
         assert made.said == "" and made.errors == []
+
+
+@pytest.mark.parametrize("kind", ["live", "baked"])
+def test_poses_of_a_far_capture_are_the_capture_s(tmp_path, kind):
+    """Its file is relative to a place of whole numbers; links and scripts are not."""
+    far = (448250.0, 5411932.0, 340.0)
+    path, pose = write(tmp_path / "a.html", kind, far), look((2.5, 0.5, 0.0), width=WIDTH, height=HEIGHT).pose
+    there = [a + b for a, b in zip(pose["position"], far)]
+    with browsers(GL, WIDTH, HEIGHT) as make:
+        tab = make().open(path).tab
+        tab.wait_for_function(READY)
+        tab.keyboard.press("]")
+        tab.wait_for_timeout(1500)
+        tab.evaluate("sceneExperts.settled()")
+        np.testing.assert_allclose(tab.evaluate("sceneExperts.pose().position"), there, atol=1e-3)
+        tab.keyboard.press("l")
+        written = tab.evaluate("new URLSearchParams(location.hash.slice(1)).get('position').split(',').map(Number)")
+        np.testing.assert_allclose(written, there, atol=1e-3)
+        tab.evaluate("pose => sceneExperts.setPose(pose)", {**pose, "position": there})
+        np.testing.assert_allclose(tab.evaluate("sceneExperts.pose().position"), there, atol=1e-6)
+
+
+def test_the_page_says_that_it_unpacks(tmp_path):
+    path = write(tmp_path / "a.html", "live")
+    with browsers(GL, WIDTH, HEIGHT) as make:
+        made = make("window.Worker = class { postMessage() {} };")  # one that never answers
+        made.tab.goto(path.as_uri())
+        made.tab.wait_for_function("window.sceneExperts")
+        assert made.said.startswith("unpacking ")
 
 
 @pytest.mark.parametrize("allowed", [True, False])

@@ -177,12 +177,12 @@ class Page {
   // event: of a change of the address, which leads to the first view where no view is in it.
   readHash(event) {
     tell("");
-    const pose = readLink(location.hash, settings.centre, tell);
+    const pose = readLink(location.hash, settings, tell);
     if (pose) this.setPose(pose);
     else if (event && !location.hash) this.home();
   }
 
-  writeHash() { putHash(writeLink(this.seen(), settings.centre, settings.distance)); }
+  writeHash() { putHash(writeLink(this.seen(), settings)); }
 
   resize() {
     fitPanels();
@@ -248,7 +248,7 @@ try {
   const page = new Page();
   page.loaded = page.load().catch((error) => { say(`The scene could not be shown: ${error.message}`); throw error; });
   window.sceneExperts = {
-    setPose: (pose) => page.setPose(fromCapture(pose, settings.centre)), pose: () => toCapture(page.seen(), settings.centre), settled: () => page.settled(), count: settings.count,
+    setPose: (pose) => page.setPose(fromCapture(pose, settings)), pose: () => toCapture(page.seen(), settings), settled: () => page.settled(), count: settings.count,
     frames: () => page.frames, page,
   };
 } catch (error) {

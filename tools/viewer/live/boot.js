@@ -18,7 +18,7 @@ export function boot(load, acts) {
     const page = new Page(settings, start(code));
     page.loaded = load(page).catch(fail);
     window.sceneExperts = {
-      setPose: (pose) => page.setPose(fromCapture(pose, settings.centre)), pose: () => toCapture(page.seen(), settings.centre),
+      setPose: (pose) => page.setPose(fromCapture(pose, settings)), pose: () => toCapture(page.seen(), settings),
       settled: () => page.settled(), count: settings.count, frames: () => page.frames, page,
     };
   } catch (error) {

@@ -202,12 +202,12 @@ export class Page {
   // event: of a change of the address, which leads to the first view where no view is in it.
   readHash(event) {
     tell("");
-    const pose = readLink(location.hash, this.settings.centre, tell);
+    const pose = readLink(location.hash, this.settings, tell);
     if (pose) this.setPose(pose);
     else if (event && !location.hash) this.home();
   }
 
-  writeHash() { putHash(writeLink(this.seen(), this.settings.centre, this.settings.distance)); }
+  writeHash() { putHash(writeLink(this.seen(), this.settings)); }
 
   resize() {
     fitPanels();

@@ -1,8 +1,10 @@
 // What surrounds the scene: the line over it, full screen, and the address.
-let said = "", told = "";
+let said = null, told = ""; // null: what the page itself says while it loads
 
 function write() {
-  const note = document.getElementById("note"), text = said || told;
+  const note = document.getElementById("note");
+  said ??= note.textContent;
+  const text = said || told;
   note.textContent = text;
   note.hidden = !text;
 }

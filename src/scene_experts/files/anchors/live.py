@@ -115,6 +115,7 @@ def page_settings(data: AnchorData, note: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "count": len(places) * about["K"],
         "centre": centre.tolist(),
+        "origin": [float(v) for v in about.get("origin", (0.0, 0.0, 0.0))],
         **view,
         "poses": [pose | _picture(picture) for pose, picture in zip(view["poses"], pictures)],
         "first": [html.pose_of(entry, centre) for entry in note.get("first") or []],

@@ -192,6 +192,7 @@ def page_settings(splats: Splats, note: Mapping[str, Any], centre: Tensor | None
         "count": len(splats),
         "unit": unit_of(splats),
         "centre": centre.tolist(),
+        "origin": [float(v) for v in note.get("origin", (0.0, 0.0, 0.0))],
         **view_settings(splats.means, note, centre),
         "background": [float(v) for v in note.get("background", (0.0, 0.0, 0.0))],
         "antialias": bool(note.get("antialias", False)),

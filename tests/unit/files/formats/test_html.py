@@ -245,6 +245,7 @@ def test_a_capture_s_views_in_the_frame_of_the_file():
     found = page_settings(blobs(), note)
     assert len(found["flight"]) == 48 and page_settings(blobs(), {})["flight"] == []
     assert found["reach"] > 0 and page_settings(blobs(), {})["reach"] is None
+    assert found["origin"] == [0.0, 0.0, 0.0] and page_settings(blobs(), note | {"origin": [1e6, 2.0, 3.0]})["origin"] == [1e6, 2.0, 3.0]
     assert found["antialias"] and found["fov"] == pytest.approx(math.degrees(2 * math.atan(0.4)))
 
 
