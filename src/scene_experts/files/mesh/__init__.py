@@ -7,6 +7,7 @@ surface (`surface`). View-dependent colours become their mean.
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,10 +39,14 @@ def write(path: Path, mesh: Any, note: dict[str, Any]) -> None:
 
 
 def draw(run: Any, capture: Any, options: Options, rasterize: Any, tell: Any) -> tuple[Any, dict[str, Any]]:
-    """Return the mesh of a run, and how it was made. See `draw.make_mesh`."""
+    """Return the mesh of a run and how it was made, see `draw.make_mesh`. The vertices are relative
+    to a local origin where float32 does not hold them otherwise."""
     from scene_experts.files.mesh.draw import MeshTask, make_mesh
+    from scene_experts.files.scene_folder import origin_note, origin_of
 
-    return make_mesh(MeshTask(run, capture, options.cells, options.crop, rasterize, tell))
+    mesh, note = make_mesh(MeshTask(run, capture, options.cells, options.crop, rasterize, tell))
+    origin = origin_of(run, capture.world)
+    return replace(mesh, vertices=mesh.vertices - np.array(origin)), note | origin_note(origin)
 
 
 FORMAT = Format(

@@ -10,6 +10,7 @@ import torch
 from scene_experts.cli import main
 from scene_experts.core.errors import InputError
 from scene_experts.files.export import Options, export
+from scene_experts.files.mesh import FORMAT
 from scene_experts.files.mesh.draw import MeshTask, draw_views, make_mesh
 from scene_experts.files.mesh.fuse import sample
 from scene_experts.training import run_folder
@@ -54,6 +55,17 @@ def test_files_open_in_trimesh_and_say_how_they_were_made(run, tmp_path):
     np.testing.assert_allclose(np.sort(two.vertices[:, 1]), np.sort(-one.vertices[:, 1]), atol=1e-5)
     assert json.loads((tmp_path / "a.mesh.ply.json").read_text())["cells"] == 24
     assert "triangles" in written.lines[1]
+
+
+def test_a_mesh_far_from_the_origin_keeps_its_vertices(run, tmp_path):
+    near = run_folder.capture_of(run)
+    place = np.array([412345.0, 5654321.0, 120.0])
+    far = replace(near, world=near.world.seen_from(tuple(-place)))
+    found, note = FORMAT.draw(run, far, Options(cells=24), None, silent)
+    alone, _ = make_mesh(MeshTask(run, near, 24, None, None, silent))
+    np.testing.assert_allclose(found.vertices + note["origin"], alone.vertices + place, atol=1e-6)
+    assert np.abs(found.vertices).max() < 100
+    near.images.close()
 
 
 def test_what_cannot_be_is_refused(run, tmp_path):
