@@ -51,6 +51,7 @@ def render(args: list[str]) -> int:
     from rich.console import Console
 
     from scene_experts.api.backend import backend
+    from scene_experts.files.scene_folder import world_of
     from scene_experts.training import run_folder
     from scene_experts.training.progress import ProgressBar
     from scene_experts.view.film import check_out, make_film
@@ -61,7 +62,10 @@ def render(args: list[str]) -> int:
     runs = [run_folder.open_run(run, device, command.step if run == command.run else None) for run in (command.run, *command.beside)]
     capture = run_folder.capture_of(runs[0], command.data)
     try:
-        film = make_film(command.options, runs, capture)
+        normalise = runs[0].config.data.normalise
+        alike = [run.cameras is None and run.config.data.normalise == normalise for run in runs]
+        worlds = [capture.world if same else world_of(run) for run, same in zip(runs, alike)]
+        film = make_film(command.options, runs, capture, worlds)
         unseen = count_unseen(film.path, capture)
         if unseen > UNSEEN * len(film.path):
             text = f"{unseen} of {len(film.path)} frames look in a direction that no photograph has (within {SEEN:.0f} degrees)"

@@ -14,7 +14,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.progress import Progress
 from scene_experts.core.types import Camera, Mode
 from scene_experts.data.capture import Capture
-from scene_experts.data.views import same_poses
+from scene_experts.data.views import World, same_poses
 from scene_experts.evaluate.pictures import join_pictures, to_8bit
 from scene_experts.render import Rasterizer, as_trained
 from scene_experts.training.run_folder import OpenRun
@@ -32,6 +32,8 @@ class Film:
     runs: Sequence[OpenRun]
     capture: Capture
     path: CameraPath
+    worlds: Sequence[World]
+    """The world of each run: the path's cameras are in that of the capture."""
 
     def write(self, out: Path, rasterize: Rasterizer, device: str, progress: Progress) -> int:
         """Write a video, or PNG files if `out` is a folder, and return the number of frames. A folder
@@ -61,13 +63,20 @@ class Film:
         background = torch.tensor(self.capture.background, device=device)
         frozen = [run.scene.frozen(run.step) for run in self.runs]
         for i, camera in enumerate(self.path.cameras):
-            camera = camera.to(device)
             tiles = []
-            for run, draws in zip(self.runs, frozen):
-                draw = as_trained(rasterize, run.config.train.antialias)
-                tiles += [paint(run.scene, camera, run.step, draw, background, look, draws) for look in looks]
+            for run, world, draws in zip(self.runs, self.worlds, frozen):
+                draw, own = as_trained(rasterize, run.config.train.antialias), self.seen_in(world, camera).to(device)
+                tiles += [paint(run.scene, own, run.step, draw, background, look, draws) for look in looks]
             yield to_8bit(join_pictures(tiles) if len(tiles) > 1 else tiles[0])
             progress("rendering", i + 1, len(self.path.cameras))
+
+    def seen_in(self, world: World, camera: Camera) -> Camera:
+        """Return a camera of the path in the world of a run."""
+        if world == self.capture.world:
+            return camera
+        pose = camera.world_to_cam
+        moved = world.camera_from_input(self.capture.world.camera_to_input(replace(camera, world_to_cam=pose.double())))
+        return replace(moved, world_to_cam=moved.world_to_cam.to(pose.dtype))
 
     @torch.no_grad()
     def draw_depth(self, rasterize: Rasterizer, device: str, frame: int) -> np.ndarray:
@@ -88,9 +97,13 @@ class Film:
             )
 
 
-def make_film(options: FilmOptions, runs: Sequence[OpenRun], capture: Capture) -> Film:
-    """Return the film of `runs`. Raises InputError for runs of different captures, unknown experts
-    and an unknown path."""
+def make_film(options: FilmOptions, runs: Sequence[OpenRun], capture: Capture, worlds: Sequence[World] = ()) -> Film:
+    """Return the film of `runs`.
+
+    worlds: Those of the runs; by default that of `capture`.
+
+    Raises InputError for runs of different captures, unknown experts and an unknown path.
+    """
     for run in runs:
         count = run.scene.traits.experts
         if options.only and max(options.only) > count:
@@ -101,7 +114,7 @@ def make_film(options: FilmOptions, runs: Sequence[OpenRun], capture: Capture) -
             raise InputError(
                 f"expected runs of one capture, with one --resolution and --split, found another in {other.path}; leave it out of --beside"
             )
-    return Film(options, runs, capture, make_path(options, capture))
+    return Film(options, runs, capture, make_path(options, capture), worlds or [capture.world] * len(runs))
 
 
 def check_out(out: Path | None) -> None:

@@ -5,11 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 import scene_experts as se
 from scene_experts import cli
 from scene_experts.core.errors import InputError
+from scene_experts.data.views import World
 from scene_experts.evaluate import pictures
 from scene_experts.training import run_folder
 from scene_experts.view.film import make_film
@@ -63,6 +65,20 @@ def test_depth_in_a_folder_is_that_of_the_layers_and_of_named_photographs(run, t
 def test_the_held_out_views_beside_another_run(run, tmp_path):
     args = ["render", str(run), "--path", "test", "--beside", str(run), "--out", str(tmp_path / "t"), "--only", "1", "2"]
     assert cli.main(args) == 0 and len(list((tmp_path / "t").glob("*.png"))) == 2
+
+
+def test_a_run_of_another_world_is_drawn_in_its_own(run):
+    opened = run_folder.open_run(run)
+    capture = run_folder.capture_of(opened)
+    other = World(3.0, (7.0, -2.0, 5.0))
+    film = make_film(FilmOptions(path="test"), [opened, opened], capture, [capture.world, other])
+    camera = film.path.cameras[0]
+    assert film.seen_in(capture.world, camera) is camera
+    seen = film.seen_in(other, camera)
+    place = other.from_input(capture.world.to_input(camera.position.double()))
+    torch.testing.assert_close(seen.position.double(), place, rtol=1e-5, atol=1e-4)
+    assert seen.near == pytest.approx(camera.near / capture.world.scale * 3) and seen.world_to_cam.dtype == camera.world_to_cam.dtype
+    capture.images.close()
 
 
 def test_a_video_lands_in_the_run_folder(run, capsys):
