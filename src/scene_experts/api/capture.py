@@ -189,7 +189,7 @@ class Capture:
     def with_seed(self, seed: int) -> Capture:
         """Return the capture with the random points of another seed; the capture itself if it has
         no random points."""
-        if seed == self.seed or (self.data.init != "random" and self.loaded.bounds is None):
+        if seed == self.seed or not self.loaded.random_points:
             return self
         return Capture(self.data, captures.load(self.data, seed), seed, self.numbers)
 

@@ -104,9 +104,10 @@ def export(args: list[str]) -> int:
         print("\n".join(file.lines))
     if command.hub is None and "html" in command.format:
         print("next: open the page in a browser; smaller pages, pages of your own, other viewers: docs/how-to.md")
-        page = max(file.bytes for file in written if file.path.suffix == ".html")
-        if page > HEAVY:
-            print(f"hint: {page / 1e6:.0f} MB load slowly for others; --max-gaussians 200000 makes a smaller page")
+        page = max((file for file in written if file.path.suffix == ".html"), key=lambda file: file.bytes)
+        if page.bytes > HEAVY:
+            smaller = "--max-gaussians 200000" if page.format == "baked-html" else "--target-mb 20"
+            print(f"hint: {page.bytes / 1e6:.0f} MB load slowly for others; {smaller} makes a smaller page")
     if command.hub is not None:
         print(f"wrote {command.hub / hub.CARD}")
         if command.licence is None:

@@ -34,7 +34,8 @@ class Data:
     """Leave out these photographs: neither train on them nor hold them out. Their folder and
     extension may be omitted where the name stays unambiguous."""
     missing: Literal["error", "drop"] = "error"
-    """What to do if the photograph of a view is missing: stop, or drop the view."""
+    """What to do if the photograph of a view is missing: stop, or drop the view. Frames of a
+    transforms.json are dropped in any case."""
     normalise: Literal["extent", "none"] = "extent"
     """extent: scale the world to a camera extent of 5 for the training; every exported file is
     scaled back. none: train in the capture's own units."""

@@ -15,7 +15,18 @@ from scene_experts.files.gaussians.read import forget_description
 from scene_experts.files.measure import OF_THE_FORMAT, Tell, capture_if_there, cost
 from scene_experts.files.options import DEFAULT, Options
 from scene_experts.files.placed import AROUND, place_cameras
-from scene_experts.files.registry import GAUSSIANS, Family, Format, Note, family_named, format_named, format_names, formats_of
+from scene_experts.files.registry import (
+    DRAWN,
+    GAUSSIANS,
+    Family,
+    Format,
+    Note,
+    family_named,
+    format_named,
+    format_names,
+    formats_of,
+    recognise,
+)
 from scene_experts.files.scene_folder import origin_note, origin_of, tell_origin, trained_in, width_in, world_of, write_scene_folder
 from scene_experts.files.standard import NOTE_FORMAT, ExportTask, Made, Written, export_gaussians
 from scene_experts.render import Rasterizer
@@ -159,9 +170,20 @@ def place_of(run: OpenRun, name: str, format: Format, out: Path | None) -> Path:
     path = file_path(run.path, name, format, out, run.lone.name)
     if path.exists() and path.samefile(run.lone.source):
         raise InputError(f"expected another file to write than the one that is read, found {path} for both; name one with --out")
-    if out is None and path.exists() and not path.with_name(path.name + ".json").exists():
+    if out is None and path.exists() and not _is_exported(path, name, format):
         raise InputError(f"expected no file at {path}, or one that export wrote, found another; name a file with --out")
     return path
+
+
+def _is_exported(path: Path, name: str, format: Format) -> bool:
+    """Return whether `export` wrote a file: it has a description beside it, or is of a format that
+    nothing else writes."""
+    if path.with_name(path.name + ".json").exists():
+        return True
+    try:
+        return format.family not in (GAUSSIANS, DRAWN) and recognise(path)[0] == name
+    except InputError:
+        return False
 
 
 def file_path(run: Path, name: str, format: Format, out: Path | None, called: str = NAME) -> Path:
@@ -250,7 +272,9 @@ def _export_drawn(work: ExportTask, out: Path | None) -> Written:
     format.write(path, contents, note)
     size, said = path.stat().st_size, str(contents)
     write_json(path.with_name(path.name + ".json"), {"format": NOTE_FORMAT, "recipe": run.config.train.recipe, "step": run.step, **note})
-    return Written(path, size, len(contents), (f"wrote {path}", f"{said}, {size / 1e6:.2f} MB, in the capture's own frame"), work.name)
+    said = f"{said}, {size / 1e6:.2f} MB, in the capture's own frame"
+    said += f", {tell_origin(note['origin'])}" if "origin" in note else ""
+    return Written(path, size, len(contents), (f"wrote {path}", said), work.name)
 
 
 def _view_note(work: ExportTask, capture: Capture | None, world: World) -> Note:

@@ -10,7 +10,7 @@ import torch
 
 from scene_experts.api.capture import Capture, load_capture
 from scene_experts.api.recipe import Recipe, recipe
-from scene_experts.bench.advice import Advice
+from scene_experts.bench.advice import Advice, suggest
 from scene_experts.bench.machine import measure_share
 from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
@@ -50,6 +50,8 @@ class TrainingPlan:
         resolution = f"longest:{advice.side}" if advice.side else "auto"
         capture = load_capture(self.place, split=self.split, resolution=resolution)
         chosen = recipe(PROPOSED, iterations=advice.iterations, exposure=self.recipe.exposure)
+        if advice.minutes is None and have is not None:
+            slow = suggest(*self.size, views).iterations / advice.iterations  # of what is trained, also where the fewest or most are
         return replace(self, capture=capture, recipe=chosen, advice=advice, slow=slow)
 
     def corrected(self, event: Stepped, left: float) -> TrainingPlan | None:
@@ -91,6 +93,9 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
         say(f"training: {describe_begun(folder, begun)}")
         return TrainingPlan(place, begun.data.split, (0, 0), capture, begun.train, begun=True)
     whole = load_capture(place, split=split)
+    if scores and not whole.test_cameras and len(whole.train_cameras) >= FEW:  # lists beside the poses hold none out
+        split = "mod8"
+        whole = load_capture(place, split=split)
     if scores and not whole.test_cameras:
         raise too_few(len(whole.train_cameras))
     size = typical_size((camera.width, camera.height) for camera in whole.cameras)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from scene_experts.core.errors import few
+from scene_experts.core.errors import InputError, few
 from scene_experts.core.io import read_json, write_atomic, write_json
 from scene_experts.core.reading.budget import CAPTURED
 from scene_experts.core.reading.pictures import opening_picture
@@ -98,6 +98,13 @@ def cut_panoramas(photos: Sequence[Photo], source: Path, target: Path, nadir: fl
     kept: dict[str, list[float]] = read_json(note, "list of views") if note.is_file() else {}  # type: ignore[assignment]
     stamps = {photo.stored: [*photo.stamp, float(rig.side), nadir] for photo in photos}
     views = {photo.stored: name_views(photo, rig, target, nadir) for photo in photos}
+    by_view: dict[str, Photo] = {}
+    for photo in photos:
+        other = by_view.setdefault(views[photo.stored][0].name, photo)
+        if other is not photo:
+            raise InputError(
+                f"expected panoramas in {source} that differ not only in extension, found '{other.name}' and '{photo.name}'; rename one"
+            )
     wanted = {target / view.name for found in views.values() for view in found}
     wanted |= {view.mask.path for found in views.values() for view in found if view.mask}
     for path in [path for name in FOLDERS for path in (target / name).rglob("*") if path.is_file() and path not in wanted]:

@@ -130,6 +130,11 @@ def test_random_points_follow_the_seed(folder, capture):
     assert np.array_equal(other.points[0], se.load_capture(folder, init="random", seed=3).points[0])
 
 
+def test_random_points_of_a_capture_without_points_follow_the_seed(folder, capture):
+    loaded = replace(capture.loaded, random_points=True, bounds=None)  # as poses of Metashape without a cloud
+    assert type(capture)(capture.data, loaded, 0, capture.numbers).with_seed(3).seed == 3
+
+
 def test_a_resolution_that_is_no_text_is_refused():
     with pytest.raises(se.InputError, match="resolution"):
         se.load_capture("anywhere", resolution=64)  # type: ignore[arg-type]

@@ -12,6 +12,7 @@ from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
 from scene_experts.files import registry
 from scene_experts.files.scene_folder import write_result_folder
+from scene_experts.files.standard import Written
 from scene_experts.render import choose
 from scene_experts.scene.anchors.mlp import MLP
 from scene_experts.training import loop as train
@@ -112,3 +113,11 @@ def test_networks_that_the_layout_cannot_say_are_told(run, tmp_path, capsys, mon
     assert export([str(run), "--format", "anchors", "--out", str(tmp_path / "other")]) == 0
     out = capsys.readouterr().out
     assert "warning" in out and "color" in out
+
+
+@pytest.mark.parametrize(("format", "said"), [("html", "--target-mb 20"), ("baked-html", "--max-gaussians 200000")])
+def test_the_hint_for_a_heavy_page_is_an_option_of_its_format(run, tmp_path, capsys, monkeypatch, format, said):
+    page = Written(tmp_path / "a.html", 30_000_000, 1, ("wrote",), format)
+    monkeypatch.setattr("scene_experts.files.export.export_several", lambda *_, **__: [page])
+    assert export([str(run), "--format", "html"]) == 0
+    assert said in capsys.readouterr().out

@@ -348,3 +348,16 @@ def test_a_page_takes_the_place_of_another_with_its_description_and_parts(tmp_pa
     assert [part.name for part in parts.iterdir()] == ["mine.txt"] and note.is_file()
     export_run(tmp_path / "run", "html", page)
     assert not note.exists()
+
+
+def test_an_export_of_a_file_is_repeated_over_its_own_but_not_over_other_files(tmp_path):
+    data = make_capture(tmp_path / "capture", views=5, size=(24, 16), points=60).folder
+    words = ["--data", str(data), "--iterations", "5", "--device", "cpu", "--preview-every", "0"]
+    assert main(["train", "scaffold-gs", "--out", str(tmp_path / "run"), *words]) == 0
+    export_run(tmp_path / "run", "compact", tmp_path / "garden.compact")
+    page = tmp_path / "garden.html"
+    for _ in range(2):
+        assert main(["export", str(tmp_path / "garden.compact"), "--format", "html"]) == 0
+    page.write_text("<!doctype html><title>mine</title>")
+    assert main(["export", str(tmp_path / "garden.compact"), "--format", "html"]) != 0
+    assert "mine" in page.read_text()

@@ -3,9 +3,18 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import pytest
+
+from scene_experts.api.capture import load_capture
+from scene_experts.api.recipe import recipe
+from scene_experts.bench import advice
 from scene_experts.bench.advice import Advice
 from scene_experts.core import checkpoint
+from scene_experts.making import plan
+from scene_experts.making.budget import MOST_OF_FEW, TimeBudget
 from scene_experts.making.plan import TrainingPlan, describe_begun
+from scene_experts.training.course import Course
+from support.synthetic import make_capture
 
 
 def test_a_training_is_not_begun_anew_for_one_that_ends_later(tmp_path):
@@ -21,3 +30,27 @@ def test_a_repeated_call_says_how_far_the_training_is(tmp_path):
     checkpoint.save(tmp_path / "checkpoints", 500, {}, {})
     told = describe_begun(tmp_path, config)
     assert "is complete: 500" in told and "--minutes" in told and str(tmp_path) in told
+
+
+def test_on_cuda_a_plan_of_few_photographs_is_corrected_by_what_it_trains(tmp_path, monkeypatch):
+    """Speeds of which the proposed 30,000 iterations and the most for few photographs tell differently."""
+    monkeypatch.setattr(advice.gsplat_install, "is_likely", lambda: True)
+    cameras = make_capture(tmp_path / "c", views=6, size=(24, 16), points=60).folder
+    first = TrainingPlan(cameras, "none", (1200, 800), load_capture(cameras, split="none"), recipe("one-network")).fit(60.0)
+    assert first.recipe.iterations == MOST_OF_FEW
+    for speed, wanted in ((200, None), (60, 60), (20, 20)):  # iterations a second
+        step = first.recipe.iterations // 10
+        seconds = step / speed
+        monkeypatch.setattr(plan, "find_course", lambda *_: Course(first.recipe.iterations))
+        other = first.corrected(SimpleNamespace(step=step, seconds=seconds), 60.0 - seconds)
+        if wanted is None:
+            assert other is None or other.recipe.iterations >= first.recipe.iterations
+        else:
+            assert other is not None and other.recipe.iterations == pytest.approx(wanted * 60, rel=0.15)
+
+
+def test_scores_hold_photographs_out_where_the_files_hold_none_out(tmp_path):
+    folder = make_capture(tmp_path / "c", views=16, size=(24, 16), points=60).folder
+    (folder / "train.txt").write_text("\n".join(path.name for path in sorted((folder / "images").iterdir())))
+    made = plan.prepare(folder, tmp_path / "run", TimeBudget(60.0), True, lambda _: None)
+    assert made.split == "mod8" and made.held == 2

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from scene_experts.core.errors import InputError
 from scene_experts.data.equirectangular import VIEWS, find_place
 from scene_experts.sfm import reconstruct as run
 from scene_experts.sfm.options import SfmOptions
 from scene_experts.sfm.panoramas import PanoramaRig, choose_held_out, cut_panoramas
 from scene_experts.sfm.photos import find_photos
 from support.captures import load
+from support.messages import naming
 from support.rooms import draw_panorama, paint_walls
 
 XMP = b'<x GPano:ProjectionType="equirectangular"/>'
@@ -41,6 +43,14 @@ def test_views_are_cut_once_and_again_where_a_panorama_changes(tmp_path):
     cut_panoramas(find_photos(source), source, target, nadir=20)
     with Image.open(first) as picture:
         assert picture.size == (40, 40)
+
+
+def test_panoramas_that_differ_in_extension_alone_are_named(tmp_path):
+    source = write_panoramas(tmp_path / "in")
+    with Image.open(source / "1.jpg") as picture:
+        picture.save(source / "1.png")
+    with pytest.raises(InputError, match=naming("1.jpg", "1.png", "rename")):
+        cut_panoramas(find_photos(source), source, tmp_path / "images")
 
 
 def test_masks_are_cut_like_their_panoramas_and_leave_the_nadir_out(tmp_path):

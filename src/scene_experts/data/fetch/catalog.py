@@ -197,7 +197,7 @@ def defaults_of(capture: str | Path) -> Defaults:
 def defaults_in(args: Sequence[str]) -> Defaults:
     """Return what the capture among the words of a command brings. Raises InputError for an unknown
     scene."""
-    words = (arg.removeprefix("--data=") for arg in args)
+    words = (arg.removeprefix("--data=").removeprefix("-s=") for arg in args)
     return defaults_of(next((word for word in words if word.startswith(PREFIX)), ""))
 
 

@@ -48,7 +48,7 @@ def test_words_select_scenes() -> None:
 def test_a_scene_brings_its_units_and_numbers() -> None:
     brought = defaults_of("catalog:bonsai")
     assert brought.normalise == "none" and ("scene.voxel_size", 0.001) in brought.numbers
-    for args in (["-s", "catalog:bonsai"], ["--data=catalog:mipnerf360/bonsai"], ["catalog:bonsai", "--out", "a"]):
+    for args in (["-s", "catalog:bonsai"], ["--data=catalog:mipnerf360/bonsai"], ["-s=catalog:bonsai"], ["catalog:bonsai", "--out", "a"]):
         assert defaults_in(args) == brought
     for args in ([], ["bonsai"], ["--out", "x/catalog:bonsai"]):
         assert defaults_in(args) == defaults_of(Path("bonsai")) == Defaults()
