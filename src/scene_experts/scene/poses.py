@@ -33,6 +33,7 @@ GROUP = "poses"  # name of the learning rate, and of the tensors in a checkpoint
 RATE = Rate(1e-4, 1e-6)  # rad and extents, from the start of the training to the end
 BEGIN, FULL = 0.05, 0.15  # shares of the training: until the first no pose moves, from the second on at the whole rate
 BUFFERS = ("ids", "gauge", "extent", "begun")
+_BLOCK = 2048  # rows of a product of matrices
 
 
 class Poses(PerView):
@@ -145,13 +146,21 @@ def pose_gradient(means: Tensor, quats: Tensor, d_means: Tensor, d_quats: Tensor
     The entries of T are differences of the sums of products of two columns, which are two small
     products of matrices.
     """
-    moved, turned = means.T @ d_means, quats.T @ d_quats  # [3, 3], [4, 4]
+    moved, turned = _product(means, d_means), _product(quats, d_quats)
     spin = turned - turned.T
     torque = _axis(moved - moved.T) + (spin[0, 1:] + _axis(spin[1:, 1:])) / 2
     force, torque = d_means.sum(0).to(pose), torque.to(pose)
     R, out = pose[:3, :3], torch.zeros_like(pose)
     out[:3, :3], out[:3, 3] = R @ skew(torque) / 2, R @ force
     return out
+
+
+def _product(a: Tensor, b: Tensor) -> Tensor:
+    """Return a^T b [C, C] of a, b [M, C], by blocks of rows: with one product, some processors add up
+    in another order with another number of threads."""
+    whole = len(a) // _BLOCK * _BLOCK
+    blocks = torch.bmm(a[:whole].reshape(-1, _BLOCK, a.shape[1]).transpose(1, 2), b[:whole].reshape(-1, _BLOCK, b.shape[1]))
+    return blocks.sum(0) + (a[whole:, :, None] * b[whole:, None, :]).sum(0)
 
 
 def _axis(m: Tensor) -> Tensor:
