@@ -59,7 +59,7 @@ def first_entries(page: Path) -> list[dict[str, Any]]:
     settings = json.loads(re.search(rb'id="settings">(.*?)</script>', page.read_bytes(), re.DOTALL)[1])  # type: ignore[index]
     out = []
     for pose in settings["first"]:
-        place = [a + b for a, b in zip(pose["position"], settings["centre"])]
+        place = [sum(parts) for parts in zip(pose["position"], settings["centre"], settings["origin"])]
         fy = 500 / math.tan(math.radians(pose["fov"] / 2))
         out.append({"position": place, "rotation": pose["rotation"], "fy": fy, "height": 1000, "width": 1000 * pose["aspect"]})
     return out

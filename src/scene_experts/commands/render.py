@@ -64,7 +64,7 @@ def render(args: list[str]) -> int:
     try:
         normalise = runs[0].config.data.normalise
         alike = [run.cameras is None and run.config.data.normalise == normalise for run in runs]
-        worlds = [capture.world if same else world_of(run) for run, same in zip(runs, alike)]
+        worlds = [capture.world if same else world_of(run_folder.with_capture(run, command.data)) for run, same in zip(runs, alike)]
         film = make_film(command.options, runs, capture, worlds)
         unseen = count_unseen(film.path, capture)
         if unseen > UNSEEN * len(film.path):

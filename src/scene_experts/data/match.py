@@ -8,6 +8,7 @@ import unicodedata
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path, PurePosixPath
 
 from scene_experts.core.errors import InputError
@@ -119,18 +120,20 @@ class NameIndex:
     def __init__(self, names: Iterable[str]) -> None:
         self._exact: dict[str, str] = {}
         self._keys: dict[str, set[str]] = defaultdict(set)
-        folders = set()
+        self._folders: dict[str, tuple[str, ...]] = {}  # below the folder that all are in
         for name in names:
             pure = PurePosixPath(_plain(name))
-            folders.add(pure.parent)
+            self._folders[name] = pure.parent.parts
             self._exact[str(pure)] = name
             for key in {str(pure), str(pure.with_suffix("")), pure.name, pure.stem}:
                 self._keys[key].add(name)
-        self._flat = len(folders) == 1
+        first, last = (min(self._folders.values()), max(self._folders.values())) if self._folders else ((), ())
+        common = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(first, last)))  # between them lie all others
+        self._folders = {name: parts[common:] for name, parts in self._folders.items()}
 
     def find(self, written: str) -> set[str]:
         """Return the names that `written` may stand for: by path, by the end of one with another or
-        no extension, or by a base name. A folder may differ only where all names are in one folder.
+        no extension, or by a base name. Folders may differ above those in which the names differ.
 
         The set has one name if `written` is unambiguous, and none if it is unknown.
         """
@@ -139,14 +142,17 @@ class NameIndex:
             return {self._exact[str(pure)]}
         bare = pure.with_suffix("") if pure.suffix.lower() in EXTENSIONS else pure
         tries = [str(each) for path in (pure, bare) for each in (path, PurePosixPath(*path.parts[1:]), path.name)]
-        groups = [group for key in tries if (group := {name for name in self._keys.get(key, ()) if self._may_be(name, pure)})]
+        groups = [group for key in tries if (group := self._alike(self._keys.get(key, set()), pure.parent.parts))]
         return next((group for group in groups if len(group) == 1), groups[0] if groups else set())
 
-    def _may_be(self, name: str, path: PurePosixPath) -> bool:
-        """Return whether the folders of a name do not contradict those of a path."""
-        own, others = PurePosixPath(_plain(name)).parent.parts, path.parent.parts
-        shared = min(len(own), len(others))
-        return self._flat or not shared or own[-shared:] == others[-shared:]
+    def _alike(self, names: set[str], folders: tuple[str, ...]) -> set[str]:
+        """Return the names whose folders end as these do. Without any: all, if one has no folder that
+        contradicts them, else none."""
+        if not folders:
+            return names
+        ends = {name: self._folders[name][-len(folders) :] for name in names}
+        alike = {name for name, end in ends.items() if end and end == folders[-len(end) :]}
+        return alike or (names if any(not self._folders[name] for name in names) else set())
 
 
 def _plain(name: str) -> str:

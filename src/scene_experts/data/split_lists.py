@@ -58,8 +58,7 @@ def _find(folders: Sequence[Path], names: Sequence[str]) -> Path | None:
 
 
 def _read(path: Path, names: Sequence[str], warnings: list[str]) -> set[str]:
-    """Return the photographs that the lines of a list name: by path, by a path without its first
-    folder or with another extension, or by a base name, if only one photograph has it."""
+    """Return the photographs that the lines of a list name, see `NameIndex.find`."""
     index = NameIndex(names)
     with opening(path, LIST) as source:
         lines = [line.strip() for line in decode_text(source.read()).splitlines()]

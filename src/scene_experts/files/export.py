@@ -16,7 +16,6 @@ from scene_experts.files.measure import OF_THE_FORMAT, Tell, capture_if_there, c
 from scene_experts.files.options import DEFAULT, Options
 from scene_experts.files.placed import AROUND, place_cameras
 from scene_experts.files.registry import (
-    DRAWN,
     GAUSSIANS,
     Family,
     Format,
@@ -170,18 +169,18 @@ def place_of(run: OpenRun, name: str, format: Format, out: Path | None) -> Path:
     path = file_path(run.path, name, format, out, run.lone.name)
     if path.exists() and path.samefile(run.lone.source):
         raise InputError(f"expected another file to write than the one that is read, found {path} for both; name one with --out")
-    if out is None and path.exists() and not _is_exported(path, name, format):
+    if out is None and path.exists() and not _is_exported(path, format):
         raise InputError(f"expected no file at {path}, or one that export wrote, found another; name a file with --out")
     return path
 
 
-def _is_exported(path: Path, name: str, format: Format) -> bool:
-    """Return whether `export` wrote a file: it has a description beside it, or is of a format that
-    nothing else writes."""
+def _is_exported(path: Path, format: Format) -> bool:
+    """Return whether `export` wrote a file: it has a description beside it, or is one of its pages.
+    Other files may be what a scene is read from."""
     if path.with_name(path.name + ".json").exists():
         return True
     try:
-        return format.family not in (GAUSSIANS, DRAWN) and recognise(path)[0] == name
+        return format.suffix == ".html" and recognise(path)[1].suffix == ".html"
     except InputError:
         return False
 

@@ -136,7 +136,7 @@ class Format:
     knows all."""
     draw: Callable[..., tuple[Any, Note]] | None = None
     """draw(run, capture, options, rasterize, tell): the contents of a file of "drawn", in the
-    capture's own frame, and how they were made."""
+    capture's own frame or relative to the `origin` of the note, and how they were made."""
 
     prepare: Callable[..., str] | None = None
     """prepare(run, capture, rasterize, device): measures at the end of a training what `fit` needs,

@@ -114,3 +114,16 @@ def test_flags_that_no_video_can_have(run, tmp_path, capsys):
     ):
         assert cli.main(["render", str(run), *wrong]) == 2
         assert fact in capsys.readouterr().err
+
+
+def test_runs_of_two_worlds_beside_each_other(run, tmp_path):
+    """One was trained in the capture's own units: it is drawn as it is alone."""
+    other, folder = tmp_path / "other", run_folder.read_config(run).data.path
+    words = ["--data", str(folder), "--out", str(other), "--iterations", "5", "--device", "cpu", "--preview-every", "0"]
+    assert cli.main(["train", "scaffold-gs", *words, "--normalise", "none"]) == 0
+    worlds = [run_folder.capture_of(run_folder.open_run(one)).world for one in (run, other)]
+    assert worlds[0] != worlds[1]
+    for first, more in ((other, []), (run, ["--beside", str(other)])):
+        assert cli.main(["render", str(first), *more, "--path", "test", "--out", str(tmp_path / first.name)]) == 0
+    alone, both = (pictures.read_picture(tmp_path / one.name / "00000.png").astype(int) for one in (other, run))
+    assert abs(both[:, -alone.shape[1] :] - alone).mean() < 0.5

@@ -100,6 +100,10 @@ def test_a_photograph_of_another_folder_is_another_one() -> None:
     assert index.find("cam1/0002.jpg") == index.find("cam1/0002") == {"images/cam1/0002.jpg"}
     assert index.find("0001.png") == index.find("/data/images/cam1/0001.jpg") == {"images/cam1/0001.jpg"}
     assert index.find("cam2/0001.jpg") == index.find("images/cam2/0001") == set()
+    other = NameIndex(["images_4/cam1/0004.jpg", "images_4/cam2/0004.jpg"])  # all are in another folder than written
+    assert other.find("images/cam1/0004.jpg") == other.find("/mnt/b/cam1/0004.png") == {"images_4/cam1/0004.jpg"}
+    some = NameIndex(["0001.jpg", "cam1/0001.jpg", "0003.jpg"])  # one at the top contradicts no folder, and is not preferred
+    assert some.find("cam2/0001.jpg") == {"0001.jpg", "cam1/0001.jpg"} and some.find("images/0003.jpg") == {"0003.jpg"}
     flat = NameIndex(["images/0001.jpg", "images/0002.jpg"])
     assert flat.find("cam/0001.jpg") == flat.find("images_4/0001.png") == {"images/0001.jpg"}
 

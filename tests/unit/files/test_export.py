@@ -356,8 +356,11 @@ def test_an_export_of_a_file_is_repeated_over_its_own_but_not_over_other_files(t
     assert main(["train", "scaffold-gs", "--out", str(tmp_path / "run"), *words]) == 0
     export_run(tmp_path / "run", "compact", tmp_path / "garden.compact")
     page = tmp_path / "garden.html"
-    for _ in range(2):
-        assert main(["export", str(tmp_path / "garden.compact"), "--format", "html"]) == 0
+    for kind in ("html", "html", "streamed-html", "baked-html", "html"):
+        assert main(["export", str(tmp_path / "garden.compact"), "--format", kind, *(["--refine", "0"] if "baked" in kind else [])]) == 0
+    before = (tmp_path / "garden.compact").read_bytes()
+    assert main(["export", str(page), "--format", "compact"]) != 0  # the page may hold less
+    assert (tmp_path / "garden.compact").read_bytes() == before
     page.write_text("<!doctype html><title>mine</title>")
     assert main(["export", str(tmp_path / "garden.compact"), "--format", "html"]) != 0
     assert "mine" in page.read_text()

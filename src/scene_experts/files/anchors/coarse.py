@@ -21,7 +21,7 @@ from scene_experts.core.types import Camera, Mode
 from scene_experts.data.views import Capture, World
 from scene_experts.files.anchors import compact
 from scene_experts.files.anchors.data import AnchorData
-from scene_experts.files.anchors.precision import Precision
+from scene_experts.files.anchors.precision import Precision, from_spread
 from scene_experts.files.anchors.read import scene as scene_of
 from scene_experts.files.anchors.rounding import rounded
 from scene_experts.files.bake.views import Views
@@ -101,8 +101,10 @@ class _Pictures:
 def make_layers(run: OpenRun, data: AnchorData, world: World, capture: Capture, rasterize: Rasterizer | None, tell: Tell) -> Layered:
     """A scene with its coarse scene.
 
-    data: with its precision. world: of the data. capture: with the cameras of the run.
+    data: with its precision, or None for the one that `compact` has then. world: of the data. capture:
+    with the cameras of the run.
     """
+    data = replace(data, precision=data.precision or from_spread(data.columns, data.networks))
     scene, step = scene_of(run, rounded(data, _precision(data)), world)
     whole = cast(AnchorScene, scene)
     pictures = _make_pictures(Painter.of(whole, step, rasterize, run.config.train.antialias), capture)
