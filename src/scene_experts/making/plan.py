@@ -51,7 +51,7 @@ class TrainingPlan:
         capture = load_capture(self.place, split=self.split, resolution=resolution)
         chosen = recipe(PROPOSED, iterations=advice.iterations, exposure=self.recipe.exposure)
         if advice.minutes is None and have is not None:
-            slow = suggest(*self.size, views).iterations / advice.iterations  # of what is trained, also where the fewest or most are
+            slow = suggest(*self.size, views).iterations / advice.iterations  # of what is trained: `have` may ask for fewer or more
         return replace(self, capture=capture, recipe=chosen, advice=advice, slow=slow)
 
     def corrected(self, event: Stepped, left: float) -> TrainingPlan | None:

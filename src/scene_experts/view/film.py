@@ -97,10 +97,10 @@ class Film:
             )
 
 
-def make_film(options: FilmOptions, runs: Sequence[OpenRun], capture: Capture, worlds: Sequence[World] = ()) -> Film:
+def make_film(options: FilmOptions, runs: Sequence[OpenRun], capture: Capture, worlds: Sequence[World]) -> Film:
     """Return the film of `runs`.
 
-    worlds: Those of the runs; by default that of `capture`.
+    worlds: Those of the runs; the first is that of `capture`.
 
     Raises InputError for runs of different captures, unknown experts and an unknown path.
     """
@@ -114,7 +114,7 @@ def make_film(options: FilmOptions, runs: Sequence[OpenRun], capture: Capture, w
             raise InputError(
                 f"expected runs of one capture, with one --resolution and --split, found another in {other.path}; leave it out of --beside"
             )
-    return Film(options, runs, capture, make_path(options, capture), worlds or [capture.world] * len(runs))
+    return Film(options, runs, capture, make_path(options, capture), worlds)
 
 
 def check_out(out: Path | None) -> None:

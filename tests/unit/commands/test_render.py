@@ -90,10 +90,10 @@ def test_a_video_lands_in_the_run_folder(run, capsys):
 def test_a_run_with_other_camera_poses_is_not_shown_beside(run):
     opened = run_folder.open_run(run)
     capture = run_folder.capture_of(opened)
-    assert len(make_film(FilmOptions(path="test"), [opened, opened], capture).runs) == 2
+    assert len(make_film(FilmOptions(path="test"), [opened, opened], capture, [capture.world] * 2).runs) == 2
     moved = replace(opened, poses="; ".join(f"{x} 0 0 1 0 0 0 1 0" for x in range(4)))
     with pytest.raises(InputError, match="one capture"):
-        make_film(FilmOptions(path="test"), [opened, moved], capture)
+        make_film(FilmOptions(path="test"), [opened, moved], capture, [capture.world] * 2)
     capture.images.close()
 
 

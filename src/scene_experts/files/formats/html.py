@@ -5,7 +5,8 @@ tools/viewer; the scene is an SPZ file in base64, in a unit that suits its sizes
 the start: `camera`, an entry as in cameras.json (position, rotation as rows of the 3x3
 camera-to-world matrix, and fov in degrees or fy and height; width is optional), `cameras`, a list
 of such entries to step through, `flight`, a closed path of such entries, `background` (RGB in [0,
-1]), `antialias` and `title`.
+1]), `antialias`, `title`, and `origin`, the place in the capture's frame that the entries are
+relative to.
 """
 
 from __future__ import annotations
