@@ -72,15 +72,18 @@ def is_exported(out: Path, step: int) -> bool:
 
 
 def export_layout(out: Path, capture: Capture) -> Exported:
-    """Write the newest checkpoint of a run folder in the layout that other tools read."""
+    """Write the newest checkpoint of a run folder in the layout that other tools read. capture: as it
+    was loaded."""
     opened = run_folder.open_run(out)
-    return Exported(opened.step, write_result_folder(opened, capture), tuple(result_warnings(opened)))
+    written = write_result_folder(opened, run_folder.at_refined_poses(capture, opened.scene))
+    return Exported(opened.step, written, tuple(result_warnings(opened)))
 
 
 def prepare_exports(out: Path, capture: Capture, rasterize: Rasterizer, device: str) -> tuple[str, ...]:
     """Measure what later exports of a trained run need and keep it in its folder. Returns a
-    sentence for each measurement."""
+    sentence for each measurement. capture: as it was loaded."""
     opened = run_folder.open_run(out)
+    capture = run_folder.at_refined_poses(capture, opened.scene)
     formats = formats_of(opened.scene.traits.family).values()
     made = [format.prepare(opened, capture, rasterize, device) for format in formats if format.prepare is not None]
     return tuple(filter(None, made))

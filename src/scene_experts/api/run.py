@@ -86,9 +86,10 @@ class Run:
         data: Path | None = None,
         training: Training | None = None,
     ) -> None:
-        """capture: the capture of the run, if it is already loaded. data: its new location.
-        training: the training of a scene in memory."""
-        self._opened, self._device, self._capture, self._data, self._training = opened, device, capture, data, training
+        """capture: the capture of the run as it was loaded, if it is already. data: its new
+        location.  training: the training of a scene in memory."""
+        self._opened, self._device, self._given, self._data, self._training = opened, device, capture, data, training
+        self._capture: Capture | None = None  # with the cameras of the run
         self._rasterize = as_trained(rasterize, opened.config.train.antialias)
         self._draws: Draws | None = None
         self._averaged: tuple[int, Scene] | None = None  # of a training with averages: the iteration, and the scene at it
@@ -131,15 +132,23 @@ class Run:
 
     @property
     def capture(self) -> Capture:
-        """The capture that the scene was trained on. It is loaded on first use.
+        """The capture that the scene was trained on, its training cameras where the scene has
+        refined them. It is loaded on first use.
 
         Raises:
             InputError: The capture is gone, or has other views than during the training.
                 `open_run(..., data=FOLDER)` states where it is.
         """
-        if self._capture is None:
-            config, loaded = self._opened.config, run_folder.capture_of(self._opened, self._data)
-            self._capture = Capture(replace(config.data, path=loaded.root), loaded, config.train.seed)
+        given, poses = self._given, self.scene.poses
+        if given is not None and poses is None:
+            return given
+        if self._capture is None or self._training:  # a training moves its cameras
+            if given is not None:
+                moved = run_folder.at_refined_poses(given.loaded, self.scene)
+                self._capture = Capture(given.data, moved, given.seed, given.numbers)
+            else:
+                config, loaded = self._opened.config, run_folder.capture_of(self._opened, self._data)
+                self._capture = Capture(replace(config.data, path=loaded.root), loaded, config.train.seed)
         return self._capture
 
     @property
@@ -353,8 +362,10 @@ class Run:
         with run_folder.held(folder):
             run_folder.prepare(folder, config, resume=False)
             state.save(training, folder / "checkpoints", keep=2)
-            recording.export_layout(folder, self.capture.loaded)
-        return Run(run_folder.open_run(folder, self._device), self._device, self._rasterize, capture=self._capture)
+            given = self._given
+            assert given is not None, "a training has its capture"
+            recording.export_layout(folder, given.loaded)
+        return Run(run_folder.open_run(folder, self._device), self._device, self._rasterize, capture=given)
 
     def _now(self) -> OpenRun:
         """The run as the package's own modules know it."""

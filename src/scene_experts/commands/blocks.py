@@ -177,6 +177,8 @@ def check_trainings(lines: list[str], data: Data) -> None:
         if words[1] == "train":
             train = parse_train(words[2:])
             check(train.cfg)
+            for name in (name for name in ("exposure", "refine_poses") if getattr(train.cfg, name)):
+                raise InputError(f"expected a training whose blocks can be merged in --train, found {flag_of(name)}; leave it out")
             found = vars(train.data)
             for name in (name for name, value in vars(data).items() if name != "views" and value != found[name]):
                 raise InputError(

@@ -46,6 +46,7 @@ def evaluate(args: list[str]) -> int:
     from scene_experts.evaluate.photographs import describe_outliers, read_photographs
     from scene_experts.evaluate.tables import print_results
     from scene_experts.report import page
+    from scene_experts.training import run_folder
 
     group = join(device_of(command.device))
     device, rasterize = group.in_turn(lambda: backend(command.device, command.rasterizer, False, False))
@@ -55,7 +56,8 @@ def evaluate(args: list[str]) -> int:
         return 0
     print_results(results, Console(markup=False, highlight=False), command.run)
     if (aligned := results.get("psnr_aligned")) is not None and aligned - results["psnr"] >= DRIFTS:
-        print(f"PSNR {aligned:.2f} dB with the colours of each picture aligned with its photograph: exposures differ (train --exposure)")
+        why = "" if run_folder.read_config(command.run).train.exposure else ": exposures may differ (train --exposure)"
+        print(f"PSNR {aligned:.2f} dB with the colours of each picture aligned with its photograph{why}")
     if not command.options.suffix:  # the page shows the held-out views, and all photographs
         for line in describe_outliers(read_photographs(command.run)):
             print(f"warning: {line}")

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import Command, parse
@@ -13,6 +13,9 @@ from scene_experts.commands import PROG
 from scene_experts.core.choices import Device, Raster
 from scene_experts.core.fields import check_fields
 from scene_experts.view.film_options import FilmOptions
+
+if TYPE_CHECKING:
+    from scene_experts.training.run_folder import OpenRun
 
 FIRST = ("out", "path", "seconds", "size", "show", "only", "beside", "step", "data", "device")
 """The options that people use first, for --help."""
@@ -51,21 +54,20 @@ def render(args: list[str]) -> int:
     from rich.console import Console
 
     from scene_experts.api.backend import backend
-    from scene_experts.files.scene_folder import world_of
     from scene_experts.training import run_folder
     from scene_experts.training.progress import ProgressBar
-    from scene_experts.view.film import check_out, make_film
+    from scene_experts.view.film import check_out, expect_one_capture, make_film
     from scene_experts.view.paths import SEEN, UNSEEN, count_unseen
 
     check_out(command.out)
     device, rasterize = backend(command.device, command.rasterizer, False, False)
     runs = [run_folder.open_run(run, device, command.step if run == command.run else None) for run in (command.run, *command.beside)]
-    capture = run_folder.capture_of(runs[0], command.data)
+    expect_one_capture(runs)
+    seen = [capture := run_folder.capture_of(runs[0], command.data)]
     try:
-        normalise = runs[0].config.data.normalise
-        alike = [run.cameras is None and run.config.data.normalise == normalise for run in runs]
-        worlds = [capture.world if same else world_of(run_folder.with_capture(run, command.data)) for run, same in zip(runs, alike)]
-        film = make_film(command.options, runs, capture, worlds)
+        for run in runs[1:]:
+            seen.append(capture if is_alike(run, runs[0]) else run_folder.capture_of(run, place_of(runs[0], command.data)))
+        film = make_film(command.options, runs, seen)
         unseen = count_unseen(film.path, capture)
         if unseen > UNSEEN * len(film.path):
             text = f"{unseen} of {len(film.path)} frames look in a direction that no photograph has (within {SEEN:.0f} degrees)"
@@ -78,6 +80,18 @@ def render(args: list[str]) -> int:
         with ProgressBar(Console(stderr=True, markup=False)) as tell:
             count = film.write(out, rasterize, device, tell)
     finally:
-        capture.images.close()
+        for each in seen:
+            each.images.close()
     print(f"wrote {out} ({count} frames, {count / film.path.fps:.1f} s)")
     return 0
+
+
+def is_alike(run: OpenRun, first: OpenRun) -> bool:
+    """Return whether two runs read their capture with the same settings, the background and the
+    near plane among them."""
+    return run.cameras is None and replace(run.config.data, path=first.config.data.path) == first.config.data
+
+
+def place_of(run: OpenRun, data: Path | None) -> Path | None:
+    """Return where the capture of a run is, for other runs on it; None for a scene without one."""
+    return data if data is not None or run.cameras is not None else run.config.data.path

@@ -33,7 +33,7 @@ from scene_experts.training import run_folder
 from scene_experts.training.background import with_background
 from scene_experts.training.batch import check_batch
 from scene_experts.training.config import RunConfig, Train, with_numbers
-from scene_experts.training.events import Exported, Stopped
+from scene_experts.training.events import Exported, Finished, Stopped
 from scene_experts.training.job import Job
 from scene_experts.training.memory import reuse_freed
 from scene_experts.training.nearest import with_near_plane
@@ -228,7 +228,7 @@ def follow(command: TrainCommand, run: Job, capture: Capture, rasterize: Rasteri
             raise KeyboardInterrupt  # a second signal does not wait
         run.stop.append(signal.Signals(number).name)
 
-    live, exported, stopped = None, False, False
+    live, exported, stopped, reached = None, False, False, 0
     if command.viewer:
         say = lambda url: console.print(f"viewer: {url}", soft_wrap=True)  # noqa: E731
         label = f"{command.cfg.recipe} on {capture.name}"
@@ -239,6 +239,8 @@ def follow(command: TrainCommand, run: Job, capture: Capture, rasterize: Rasteri
             for event in recording.train(run, capture, rasterize):
                 progress(event)
                 stopped = stopped or isinstance(event, Stopped)
+                if isinstance(event, Finished):
+                    reached = event.step
                 if isinstance(event, Exported):
                     exported = True
                     for warning in event.warnings:
@@ -255,6 +257,10 @@ def follow(command: TrainCommand, run: Job, capture: Capture, rasterize: Rasteri
         console.print(f"next: {shlex.join([PROG, 'eval', str(command.out)])}", soft_wrap=True)
     else:
         asked, whole = command.options.stop_at or 0, command.cfg.iterations
+        if reached < whole:
+            text = f"the training was already at iteration {reached:,} of {whole:,}; the files of the run are unchanged"
+            console.print(f"{text}; to go on, give a larger --stop-at than {asked:,} or none", soft_wrap=True)
+            return 0
         longer = f"; --stop-at {asked:,} is beyond the {whole:,} iterations of its schedule" if asked > whole else ""
         go_on = f"; for more, train into another --out with --init-from {command.out} and more --iterations"
         console.print(f"the training was already complete; the files of the run are unchanged{longer}{go_on}", soft_wrap=True)

@@ -261,7 +261,8 @@ def train(plan: TrainingPlan, folder: Path, budget: TimeBudget, progress: Whole,
         how = "slower" if other.slow > plan.slow else "faster"
         plan, now = other, f"{other.recipe.iterations:,} iterations, {other.capture.data.resolution}"
         say(f"the machine is {how} than estimated: the training begins anew, {now}")
-    psnr = fmean(one.psnr for one in recent) if recent else None
+    known = [one.psnr for one in recent if one.psnr is not None]
+    psnr = fmean(known) if known else None
     return trainer.run, psnr
 
 

@@ -49,6 +49,13 @@ class Exposures(PerView):
         self.register_buffer("positions", torch.stack([camera.position.cpu().float() for camera in cameras]))
         self.register_buffer("directions", torch.stack([_direction(camera) for camera in cameras]))
 
+    def continue_from(self, earlier: Exposures) -> None:
+        """Take the stops of the photographs that an earlier training has seen."""
+        with torch.no_grad():
+            for id, row in self.row.items():
+                if id in earlier.row:
+                    self.stops[row] = earlier.stops[earlier.row[id]].to(self.stops)
+
     def stops_of(self, camera: Camera) -> Tensor:
         """Return the stops [3] of a camera, relative to the mean of the training photographs."""
         stops = self.stops - self.stops.mean(0)

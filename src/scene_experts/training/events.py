@@ -44,8 +44,8 @@ class Stepped:
     """The iteration, counted from 1."""
     terms: dict[str, float]
     """Terms of the loss by name, weighted; their sum is the loss."""
-    psnr: float
-    """PSNR of the training view, dB, where its mask counts."""
+    psnr: float | None
+    """PSNR of the training view, dB, where its mask counts; None if it counts nowhere."""
     anchors: int
     """Number of rows: anchors, Gaussians or graph points."""
     visible: int

@@ -18,6 +18,7 @@ from scene_experts.core.reading.source import guarding
 from scene_experts.data.capture import Capture
 from scene_experts.data.settings import Data
 from scene_experts.scene import SceneConfig
+from scene_experts.scene.exposure import Exposures
 from scene_experts.scene.fit import restore_foreign
 from scene_experts.scene.poses import Poses
 from scene_experts.training.config import RunConfig, Train
@@ -49,7 +50,8 @@ def start_from(cfg: Train, run: Path, capture: Capture, device: str, now: RunCon
         with guarding(run, RUN):
             scene = restore_foreign(cfg.scene, tensors, meta, averaged=True).to(device)
             scene.forget_rounding()
-            scene.exposures, scene.poses = new_exposures(cfg, capture), new_poses(cfg, capture, Poses.restore(tensors))
+            scene.exposures = new_exposures(cfg, capture, Exposures.restore(tensors))
+            scene.poses = new_poses(cfg, capture, Poses.restore(tensors))
             training = Training(cfg, scene.to(device))
     except InputError as error:
         if other := _changes(before.train.scene, now.train.scene, "scene"):

@@ -297,7 +297,7 @@ def preview(training: Training, run: Job, capture: Capture, rasterize: Rasterize
     must call this."""
     exchange = exchange or Direct(training, run.group, run.stop)
     index = (capture.test or capture.train)[0]
-    camera = capture.views[index].camera.to(run.device, run.dtype)
+    camera = camera_of(training, capture, index, run.device, run.dtype)
     with training.averaged():
         cameras = [camera, *([None] * (run.group.size - 1))]
         scene = exchange.scene_of(cameras, training.step, Mode.DRAW, rasterize.visible)

@@ -37,7 +37,8 @@ def measure_step(training: Training, done: Iteration) -> Stepped:
     """Compute the statistics of the last iteration."""
     decoded = done.decoded
     error = done.render.image.clamp(0, 1).sub_(done.target).square_()
-    mse = float(error.mean() if done.mask is None else (error.mean(2) * done.mask).sum() / done.mask.sum().clamp_min(1e-12))
+    counts = error.new_tensor(error[..., 0].numel()) if done.mask is None else done.mask.sum()
+    mse = float(error.mean() if done.mask is None else (error.mean(2) * done.mask).sum() / counts.clamp_min(1e-12))
     raw = decoded.raw_opacity
     balance, entropy = {}, {}
     for attribute, r in decoded.routing.items():
@@ -48,7 +49,7 @@ def measure_step(training: Training, done: Iteration) -> Stepped:
     return Stepped(
         step=training.step,
         terms={k: float(v) for k, v in done.terms.items()},
-        psnr=-10.0 * math.log10(max(mse, 1e-10)),
+        psnr=-10.0 * math.log10(max(mse, 1e-10)) if counts > 0 else None,
         anchors=training.scene.table.total,
         visible=len(decoded.rows),
         gaussians=len(decoded.gaussians),

@@ -110,7 +110,9 @@ class TrainingProgress:
         and remaining time."""
         for name, value in event.terms.items():
             self.loss[name] = SMOOTHING * self.loss.get(name, value) + (1 - SMOOTHING) * value
-        self.psnr = event.psnr if self.psnr is None else SMOOTHING * self.psnr + (1 - SMOOTHING) * event.psnr
+        if event.psnr is not None:
+            self.psnr = event.psnr if self.psnr is None else SMOOTHING * self.psnr + (1 - SMOOTHING) * event.psnr
+        psnr = "-" if self.psnr is None else f"{self.psnr:.2f}"
         done = self.course.spent(event.step)
         speed, pace = self.pace(event.step), self.cost(done)
         left = "-:-- left"
@@ -119,7 +121,7 @@ class TrainingProgress:
         terms = " ".join(f"{name} {value:.4f}" for name, value in self.loss.items())
         active = f"active {100 * event.active:.0f} %  " if self.traits.activation else ""
         line = (  # a narrow terminal cuts the end off
-            f"{event.step:>6,}/{self.total:,}  {left}  training PSNR {self.psnr:.2f}  {self.traits.rows} {event.anchors:,}  {active}{terms}"
+            f"{event.step:>6,}/{self.total:,}  {left}  training PSNR {psnr}  {self.traits.rows} {event.anchors:,}  {active}{terms}"
         )
         if self.live:
             self.live.update(Text(line, no_wrap=True, overflow="ellipsis"))

@@ -90,7 +90,7 @@ class Recorder:
             "scene/active": event.active,
         }
         values |= {f"experts/{a}/{i}": share for a, shares in event.routing.items() for i, share in enumerate(shares)}
-        for name, value in values.items():
+        for name, value in ((name, value) for name, value in values.items() if value is not None):
             self.board.add_scalar(name, value, event.step)
 
 

@@ -278,7 +278,13 @@ def capture_of(run: OpenRun, data: Path | None = None) -> Capture:
         capture.images.close()
         raise InputError(f"expected the capture that {run.path} was trained on, found other views in {capture.root}; give the right --data")
     capture.expect_poses(run.poses, run.path)
-    return capture if run.scene.poses is None else capture.with_cameras(run.scene.poses.refine)
+    return at_refined_poses(capture, run.scene)
+
+
+def at_refined_poses(capture: Capture, scene: Scene) -> Capture:
+    """Return a capture as it was loaded with its training cameras where a scene has refined
+    them."""
+    return capture if scene.poses is None else capture.with_cameras(scene.poses.refine)
 
 
 def with_capture(run: OpenRun, data: Path | None) -> OpenRun:

@@ -177,7 +177,9 @@ class Training:
         if self.averages is None:
             return self.scene
         own = {name: value.clone() for name, value in self.tensors().items() if name.startswith(("average.", "facts."))}
-        return restore_scene(self.cfg.scene, own, self.meta(), averaged=True).to(self.scene.table.device)
+        made = restore_scene(self.cfg.scene, own, self.meta(), averaged=True).to(self.scene.table.device)
+        made.exposures, made.poses = self.scene.exposures, self.scene.poses
+        return made
 
     def rates(self) -> dict[str, float]:
         """Return the current learning rates by group."""
@@ -252,9 +254,15 @@ class Training:
         return training
 
 
-def new_exposures(cfg: Train, capture: Capture) -> Exposures | None:
-    """Return the exposures of a training that begins; None where it learns none."""
-    return Exposures([capture.views[i].camera for i in capture.train]) if cfg.exposure else None
+def new_exposures(cfg: Train, capture: Capture, earlier: Exposures | None = None) -> Exposures | None:
+    """Return the exposures of a training that begins, from those of an earlier one of the same
+    scene; None where it learns none."""
+    if not cfg.exposure:
+        return None
+    made = Exposures([capture.views[i].camera for i in capture.train])
+    if earlier is not None:
+        made.continue_from(earlier)
+    return made
 
 
 def new_poses(cfg: Train, capture: Capture, earlier: Poses | None = None) -> Poses | None:

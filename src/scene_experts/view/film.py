@@ -14,7 +14,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.progress import Progress
 from scene_experts.core.types import Camera, Mode
 from scene_experts.data.capture import Capture
-from scene_experts.data.views import World, same_poses
+from scene_experts.data.views import same_poses
 from scene_experts.evaluate.pictures import join_pictures, to_8bit
 from scene_experts.render import Rasterizer, as_trained
 from scene_experts.training.run_folder import OpenRun
@@ -32,8 +32,9 @@ class Film:
     runs: Sequence[OpenRun]
     capture: Capture
     path: CameraPath
-    worlds: Sequence[World]
-    """The world of each run: the path's cameras are in that of the capture."""
+    captures: Sequence[Capture]
+    """The capture as each run sees it, with its own world, background and near plane; the first is
+    `capture`, whose world the path's cameras are in."""
 
     def write(self, out: Path, rasterize: Rasterizer, device: str, progress: Progress) -> int:
         """Write a video, or PNG files if `out` is a folder, and return the number of frames. A folder
@@ -60,23 +61,23 @@ class Film:
         """Yield the frames as 8-bit RGB [H, W, 3]: every run in every mode, side by side."""
         only = tuple(number - 1 for number in self.options.only) or None
         looks = [Look(show=show, attribute=self.options.attribute, only=only) for show in self.options.show]
-        background = torch.tensor(self.capture.background, device=device)
+        behind = [torch.tensor(capture.background, device=device) for capture in self.captures]
         frozen = [run.scene.frozen(run.step) for run in self.runs]
         for i, camera in enumerate(self.path.cameras):
             tiles = []
-            for run, world, draws in zip(self.runs, self.worlds, frozen):
-                draw, own = as_trained(rasterize, run.config.train.antialias), self.seen_in(world, camera).to(device)
+            for run, capture, background, draws in zip(self.runs, self.captures, behind, frozen):
+                draw, own = as_trained(rasterize, run.config.train.antialias), self.seen_in(capture, camera).to(device)
                 tiles += [paint(run.scene, own, run.step, draw, background, look, draws) for look in looks]
             yield to_8bit(join_pictures(tiles) if len(tiles) > 1 else tiles[0])
             progress("rendering", i + 1, len(self.path.cameras))
 
-    def seen_in(self, world: World, camera: Camera) -> Camera:
-        """Return a camera of the path in the world of a run."""
-        if world == self.capture.world:
+    def seen_in(self, capture: Capture, camera: Camera) -> Camera:
+        """Return a camera of the path in the world of a run, with the near plane of that run."""
+        if capture is self.capture:
             return camera
         pose = camera.world_to_cam
-        moved = world.camera_from_input(self.capture.world.camera_to_input(replace(camera, world_to_cam=pose.double())))
-        return replace(moved, world_to_cam=moved.world_to_cam.to(pose.dtype))
+        moved = capture.world.camera_from_input(self.capture.world.camera_to_input(replace(camera, world_to_cam=pose.double())))
+        return replace(moved, world_to_cam=moved.world_to_cam.to(pose.dtype), near=capture.views[0].camera.near)
 
     @torch.no_grad()
     def draw_depth(self, rasterize: Rasterizer, device: str, frame: int) -> np.ndarray:
@@ -97,24 +98,28 @@ class Film:
             )
 
 
-def make_film(options: FilmOptions, runs: Sequence[OpenRun], capture: Capture, worlds: Sequence[World]) -> Film:
+def make_film(options: FilmOptions, runs: Sequence[OpenRun], captures: Sequence[Capture]) -> Film:
     """Return the film of `runs`.
 
-    worlds: Those of the runs; the first is that of `capture`.
+    captures: As each run sees it; the path is in the world of the first.
 
-    Raises InputError for runs of different captures, unknown experts and an unknown path.
+    Raises InputError for unknown experts and an unknown path.
     """
     for run in runs:
         count = run.scene.traits.experts
         if options.only and max(options.only) > count:
             has = f"experts 1 to {count}" if count else "no experts"
             raise InputError(f"expected --only among the experts of {run.path}, which has {has}, found {max(options.only)}; change it")
+    return Film(options, runs, captures[0], make_path(options, captures[0]), captures)
+
+
+def expect_one_capture(runs: Sequence[OpenRun]) -> None:
+    """Raise InputError for runs of different captures."""
     for other in runs[1:]:
         if (other.capture and other.capture != runs[0].capture) or not same_poses(other.poses, runs[0].poses):
             raise InputError(
                 f"expected runs of one capture, with one --resolution and --split, found another in {other.path}; leave it out of --beside"
             )
-    return Film(options, runs, capture, make_path(options, capture), worlds)
 
 
 def check_out(out: Path | None) -> None:

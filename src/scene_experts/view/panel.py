@@ -3,6 +3,7 @@ the curves of a training."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -300,7 +301,7 @@ class Panel:
         match event:
             case Stepped():
                 self.curves["step"].append(float(event.step))
-                self.curves["psnr"].append(event.psnr)
+                self.curves["psnr"].append(math.nan if event.psnr is None else event.psnr)
                 self.curves["loss"].append(sum(event.terms.values()))
                 if time.monotonic() - self.curve_time > CURVE_INTERVAL:
                     self.curve_time = time.monotonic()

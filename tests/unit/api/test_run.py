@@ -1,6 +1,8 @@
 """Runs: drawn, scored, exported, found again."""
 
+import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +12,8 @@ from PIL import Image
 import scene_experts as se
 from scene_experts.evaluate.pictures import to_8bit
 from support.messages import naming
+from support.synthetic import make_capture
+from support.tracks import add_tracks
 
 
 def test_a_picture_is_the_one_that_eval_draws(run, capture):
@@ -121,3 +125,25 @@ def test_frames_go_to_pictures_or_a_video(run, capture, tmp_path):
     for out, some, fps in (("a.mp4", [], 24.0), ("a.mp4", cameras, 0.0), ("a.txt", cameras, 24.0)):
         with pytest.raises(se.InputError):
             run.write_video(tmp_path / out, some, fps=fps)
+
+
+def test_a_run_with_refined_poses_has_its_own_cameras(tmp_path):
+    folder = make_capture(tmp_path / "c", views=12, mixed_sizes=False).folder
+    add_tracks(folder, turned=0.03, shifted=0.05)
+    recipe = se.recipe("scaffold-gs", iterations=30, refine_poses=True)
+    quiet = {"progress": False, "preview_every": 0, "device": "cpu"}
+    run = se.train(recipe, se.load_capture(folder, split="mod8"), tmp_path / "run", **quiet)
+    again, memory = se.open_run(tmp_path / "run"), se.train(recipe, se.load_capture(folder, split="mod8"), **quiet)
+    saved = memory.save(tmp_path / "saved")
+    raw = se.load_capture(folder, split="mod8").train_cameras
+    given = np.stack([camera.position for camera in raw])
+    for one in (run, again, memory, saved):
+        found = np.stack([camera.position for camera in one.train_cameras])
+        assert np.abs(found - given).max() > 0.01
+        np.testing.assert_allclose(found, np.stack([camera.position for camera in again.train_cameras]), atol=1e-4)
+    scores = [one.evaluate("train", lpips=False).psnr for one in (run, again)]
+    assert scores[0] == scores[1]
+    for name in ("run", "saved"):
+        written = {c["img_name"]: c["position"] for c in json.loads((tmp_path / name / "cameras.json").read_text())}
+        told = np.stack([written[Path(run.capture.names[i]).stem] for i in run.capture.loaded.train])
+        np.testing.assert_allclose(told, np.stack([camera.position for camera in again.train_cameras]), atol=1e-4)

@@ -99,6 +99,8 @@ def test_words_that_do_not_fit(capture, tmp_path, capsys):
         (["blocks", "plan", str(capture), *out, "--iterations", "100", "--train=--batch 8"], "--batch 8 divides"),
         (["blocks", "plan", str(capture), *out, "--blocks", "300"], "same coordinate; give smaller --blocks"),
         (["blocks", "plan", str(capture), *out, "--train=--seed '3"], "--train"),
+        (["blocks", "plan", str(capture), *out, "--train=--exposure"], "--exposure"),
+        (["blocks", "plan", str(capture), *out, "--train=--refine-poses"], "--refine-poses"),
         (["blocks", "plan", str(capture), *out, "--train=--resolution longest:40"], "--resolution"),
         (["blocks", "merge", str(tmp_path), *out, "--runs", str(tmp_path)], "plan.json"),
     ):

@@ -14,7 +14,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.data.views import World
 from scene_experts.evaluate import pictures
 from scene_experts.training import run_folder
-from scene_experts.view.film import make_film
+from scene_experts.view.film import expect_one_capture, make_film
 from scene_experts.view.film_options import FilmOptions
 from support.synthetic import make_capture
 
@@ -71,13 +71,15 @@ def test_a_run_of_another_world_is_drawn_in_its_own(run):
     opened = run_folder.open_run(run)
     capture = run_folder.capture_of(opened)
     other = World(3.0, (7.0, -2.0, 5.0))
-    film = make_film(FilmOptions(path="test"), [opened, opened], capture, [capture.world, other])
+    views = tuple(replace(view, camera=replace(view.camera, near=0.7)) for view in capture.views)
+    elsewhere = replace(capture, world=other, views=views)
+    film = make_film(FilmOptions(path="test"), [opened, opened], [capture, elsewhere])
     camera = film.path.cameras[0]
-    assert film.seen_in(capture.world, camera) is camera
-    seen = film.seen_in(other, camera)
+    assert film.seen_in(capture, camera) is camera
+    seen = film.seen_in(elsewhere, camera)
     place = other.from_input(capture.world.to_input(camera.position.double()))
     torch.testing.assert_close(seen.position.double(), place, rtol=1e-5, atol=1e-4)
-    assert seen.near == pytest.approx(camera.near / capture.world.scale * 3) and seen.world_to_cam.dtype == camera.world_to_cam.dtype
+    assert seen.near == 0.7 and seen.world_to_cam.dtype == camera.world_to_cam.dtype
     capture.images.close()
 
 
@@ -89,12 +91,22 @@ def test_a_video_lands_in_the_run_folder(run, capsys):
 
 def test_a_run_with_other_camera_poses_is_not_shown_beside(run):
     opened = run_folder.open_run(run)
-    capture = run_folder.capture_of(opened)
-    assert len(make_film(FilmOptions(path="test"), [opened, opened], capture, [capture.world] * 2).runs) == 2
+    expect_one_capture([opened, opened])
     moved = replace(opened, poses="; ".join(f"{x} 0 0 1 0 0 0 1 0" for x in range(4)))
     with pytest.raises(InputError, match="one capture"):
-        make_film(FilmOptions(path="test"), [opened, moved], capture, [capture.world] * 2)
-    capture.images.close()
+        expect_one_capture([opened, moved])
+
+
+def test_a_run_beside_another_has_its_own_background_and_near_plane(run, tmp_path):
+    other = tmp_path / "other"
+    data = str(run_folder.read_config(run).data.path)
+    words = ["train", "one-network", "--data", data, "--out", str(other), "--iterations", "30", "--preview-every", "0"]
+    assert cli.main([*words, "--background", "0.9", "0.1", "0.4", "--near", "1.7", "--device", "cpu"]) == 0
+    show = ["--path", "test", "--out"]
+    for name, runs in (("alone", [other]), ("beside", [run, "--beside", other])):
+        assert cli.main(["render", *map(str, runs), *show, str(tmp_path / name)]) == 0
+    alone, both = (np.array(Image.open(tmp_path / name / "00000.png")) for name in ("alone", "beside"))
+    assert np.array_equal(both[:, -alone.shape[1] :], alone)
 
 
 @pytest.mark.parametrize(("path", "said"), [("orbit", "--path spiral or views stays"), ("spiral", "fog; --path views stays")])

@@ -8,10 +8,15 @@ import torch
 from PIL import Image
 
 from scene_experts.core.errors import InputError
+from scene_experts.data.settings import Data
 from scene_experts.scene.exposure import GAMMA, Exposures
 from scene_experts.training import run_folder
+from scene_experts.training.average import Average
+from scene_experts.training.config import RunConfig
 from scene_experts.training.events import Stepped
+from scene_experts.training.init_from import start_from
 from scene_experts.training.shards import check_shard
+from scene_experts.training.state import Training
 from support.captures import load
 from support.synthetic import make_capture
 from support.trainings import assert_same, config, events, last_tensors
@@ -71,3 +76,20 @@ def test_a_run_is_opened_with_its_exposures(folder, tmp_path):
 def test_shards_refuse_exposures():
     with pytest.raises(InputError, match="--exposure"):
         check_shard(replace(config("scaffold-gs"), exposure=True), 0.0, viewer=False)
+
+
+def test_a_training_goes_on_with_the_exposures_of_another(folder, tmp_path):
+    cfg = config("scaffold-gs", exposure=True)
+    run_folder.prepare(tmp_path, RunConfig(cfg, Data(folder)), resume=False)
+    list(events(cfg, folder, tmp_path, stop_at=20))
+    earlier = last_tensors(tmp_path)["exposure.stops"]
+    made = start_from(cfg.scaled(), tmp_path, load(folder), "cpu", RunConfig(cfg, Data(folder)))
+    assert earlier.abs().max() > 0 and torch.equal(made.scene.exposures.stops, earlier)
+
+
+def test_averages_keep_the_exposures_and_the_poses(folder):
+    cfg = replace(config("scaffold-gs", exposure=True, refine_poses=True), average=Average(span=0.2))
+    training = Training.start(cfg.scaled(), load(folder), "cpu")
+    made = training.averaged_scene()
+    assert made is not training.scene
+    assert made.exposures is training.scene.exposures and made.poses is training.scene.poses

@@ -37,6 +37,7 @@ def test_the_psnr_of_a_step_is_that_of_the_pixels_that_count(folder):
     mse = float((done.render.image.detach().clamp(0, 1) - done.target)[:, columns].square().mean())
     assert measure_step(training, replace(done, mask=half)).psnr == pytest.approx(-10 * math.log10(mse), rel=1e-5)
     assert measure_step(training, done).psnr != pytest.approx(-10 * math.log10(mse), rel=1e-5)
+    assert measure_step(training, replace(done, mask=torch.zeros_like(half))).psnr is None
 
 
 def test_steps_tell_the_balance_of_the_experts(folder):

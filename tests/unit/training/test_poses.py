@@ -7,12 +7,16 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.types import Mode
 from scene_experts.data.settings import Data
 from scene_experts.geometry.poses import exp_motion
+from scene_experts.render import choose
 from scene_experts.scene.poses import Poses
 from scene_experts.training import run_folder
 from scene_experts.training.config import RunConfig
 from scene_experts.training.init_from import start_from
+from scene_experts.training.job import Job
+from scene_experts.training.loop import preview
 from scene_experts.training.shards import check_shard
 from scene_experts.training.state import Training
 from support.captures import load
@@ -88,3 +92,17 @@ def test_disturbed_poses_are_found_again(folder):
 
     cameras = [disturbed.views[i].camera for i in disturbed.train]
     assert error([poses.refine(c) for c in cameras]) < 0.8 * error(cameras)
+
+
+def test_the_preview_of_a_training_view_is_from_its_refined_pose(folder):
+    capture, rasterize = load(folder, split="none"), choose("auto", "cpu")
+    training = Training.start(config("scaffold-gs", refine_poses=True).scaled(), capture, "cpu")
+    with torch.no_grad():
+        training.scene.poses.motions[0, 4] += 0.05
+    run = Job(RunConfig(training.cfg, Data(folder, split="none")))
+    shown = preview(training, run, capture, rasterize)
+    camera = training.scene.poses.refine(capture.views[capture.train[0]].camera)
+    with torch.no_grad():
+        decoded = training.scene(camera, training.step, Mode.DRAW, rasterize.visible)
+    image = rasterize(decoded.gaussians, camera, torch.tensor(capture.background)).image.clamp(0, 1)
+    torch.testing.assert_close(shown.picture, image, rtol=0, atol=1e-6)
