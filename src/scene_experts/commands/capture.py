@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -38,8 +38,10 @@ def capture(args: list[str]) -> int:
 
     from scene_experts.commands.next_step import propose_training
     from scene_experts.core.console import LastingConsole
+    from scene_experts.data.readers.colmap import find_models
     from scene_experts.data.settings import Data
     from scene_experts.sfm.reconstruct import reconstruct
+    from scene_experts.sfm.work import PLACES
     from scene_experts.training.progress import ProgressBar
 
     console = LastingConsole(markup=False, highlight=False)
@@ -49,7 +51,13 @@ def capture(args: list[str]) -> int:
     for line in summarise(note):
         say(line)
     width, height = note["size"]
-    say(propose_training(Data(command.out), width, height, note["with_pose"]))
+    data = Data(command.out)
+    if others := [place.name for place in find_models(command.out) if place != command.out / PLACES["model"]]:
+        data = replace(data, model=PLACES["model"])
+        say(
+            f"{command.out / 'sparse'} also holds {', '.join(others)} of another reconstruction, left as it is; --model chooses"
+        )
+    say(propose_training(data, width, height, note["with_pose"]))
     return 0
 
 

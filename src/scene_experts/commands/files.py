@@ -127,7 +127,9 @@ def import_(args: list[str]) -> int:
 
     asked = named(command.data)
     print(f"wrote {import_files(command.source, asked, command.out, command.iteration, command.transform)}")
-    if own := [word for place, value in changes(asked, read_config(command.out).data) or [] for word in words_of(place, value)]:
+    if own := [
+        word for place, value in changes(asked, read_config(command.out).data) or [] if place != "path" for word in words_of(place, value)
+    ]:
         print(f"read as its training did, by {shlex.join(own)}; give other values to choose otherwise")
     print(f"next: {shlex.join([PROG, 'eval', str(command.out)])}")
     return 0

@@ -227,6 +227,7 @@ def _assemble(root: Path, kind: str, raw: RawCapture, centred: bool, background:
         states_split=raw.states_split,
         bounds=raw.bounds,
         applied=raw.applied,
+        applied_scale=raw.applied_scale,
         model=raw.model,
     )
 

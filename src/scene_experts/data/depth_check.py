@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera
 from scene_experts.data.views import Capture
 
@@ -21,12 +23,24 @@ def check_depths(capture: Capture) -> Capture:
     a note; without all of them where that is true of most.
 
     Maps that a network has guessed, or in another unit than the poses, would bend the scene in
-    silence. Raises InputError if a map is damaged.
+    silence. So are maps that cannot be read.
     """
     having = [i for i, view in enumerate(capture.views) if view.depth is not None]
     if not having or capture.points is None or capture.random_points:
         return capture
-    ratios = {i: ratio for i in having if (ratio := find_ratio(capture, i)) is not None}
+    ratios: dict[int, float] = {}
+    damaged: dict[int, InputError] = {}
+    for i in having:
+        try:
+            if (ratio := find_ratio(capture, i)) is not None:
+                ratios[i] = ratio
+        except InputError as error:
+            damaged[i] = error
+    if damaged:
+        capture = _without(
+            capture, damaged, f"{len(damaged)} of {len(having)} depth maps are left out (first: {next(iter(damaged.values()))})"
+        )
+        having = [i for i in having if i not in damaged]
     wrong = [i for i, ratio in ratios.items() if abs(math.log(ratio)) > math.log(AGREE)]
     if not wrong:
         return capture
@@ -37,7 +51,12 @@ def check_depths(capture: Capture) -> Capture:
         f"{len(out)} of {len(having)} depth maps are left out: the points lie at {times} times their depth; "
         f"give maps in thousandths of the unit of the poses"
     )
-    views = tuple(replace(view, depth=None) if i in out else view for i, view in enumerate(capture.views))
+    return _without(capture, out, note)
+
+
+def _without(capture: Capture, left_out: Collection[int], note: str) -> Capture:
+    """Return the capture without the depth maps of some views, and with a note."""
+    views = tuple(replace(view, depth=None) if i in left_out else view for i, view in enumerate(capture.views))
     return replace(capture, views=views, warnings=(*capture.warnings, note))
 
 

@@ -142,6 +142,7 @@ class Capture:
     bounds: tuple[Vector, Vector] | None = None  # lower and upper corner of the scene in the capture's own frame; None: unknown
 
     applied: object = None  # rows of the 3x4 matrix that turned a reconstruction into the capture's own frame, unchecked
+    applied_scale: object = None  # factor from the reconstruction's unit to the capture's own, unchecked; None: 1
     random_points: bool = False  # its points are random
     model: Path | None = None  # folder of the reconstruction that was read, if it is COLMAP's
     omitted: tuple[str, ...] = ()  # names of the photographs that --leave-out leaves out; they have no views

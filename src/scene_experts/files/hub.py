@@ -25,6 +25,7 @@ from scene_experts.core.version import __version__
 from scene_experts.data.capture import Capture
 from scene_experts.evaluate.pictures import to_8bit, write_picture
 from scene_experts.evaluate.results import load_results
+from scene_experts.files import registry
 from scene_experts.files.export import export_several
 from scene_experts.files.measure import Painter, Tell, capture_if_there
 from scene_experts.files.options import DEFAULT, Options
@@ -35,6 +36,7 @@ from scene_experts.view.paths import choose_best_view
 
 log: logging.Logger = logging.getLogger(__name__)
 CARD, PREVIEW = "README.md", "preview.png"
+_OWN = b"library_name: scene-experts"  # in the head of a card of ours
 UNKNOWN = "unknown"
 METRICS = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS"}
 _NOTICES = ("LICENSE*", "LICENCE*", "ATTRIBUTION*", "NOTICE*")  # in a capture's folder
@@ -78,6 +80,8 @@ def write_hub(
     """
     if folder.is_file():
         raise InputError(f"expected a folder for --hub, found the file {folder}; name a folder")
+    if (folder / CARD).exists() and not _is_own_card(folder / CARD):
+        raise InputError(f"expected no {CARD} in {folder}, or one that export wrote, found another; move it away, or name another folder")
     folder.mkdir(parents=True, exist_ok=True)
     check_writable(folder / CARD)
     with capture_if_there(run, needed=True) as capture:
@@ -89,6 +93,12 @@ def write_hub(
     imports = options.frame == "capture" or any(format_named(name).family != GAUSSIANS for name in names)
     write_bytes(folder / CARD, make_card(run, written, find_scores(run), licence, notices, imports).encode())
     return written
+
+
+def _is_own_card(path: Path) -> bool:
+    """Return whether `export` wrote a card."""
+    with opening(path, budget.NOTE) as source:
+        return _OWN in source.head(registry.HEAD)
 
 
 def find_scores(run: OpenRun) -> dict[str, Any]:

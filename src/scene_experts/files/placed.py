@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from scene_experts.core.errors import InputError
 from scene_experts.core.io import read_json
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.numbers import FARTHEST, number
@@ -44,14 +45,17 @@ def place_cameras(
     source: file or folder of the scene. positions: [N, 3] float64 of its rows, trained world. world:
     how that follows from the frame of the scene's capture. origin: place in the latter that the
     file and the cameras.json beside it are relative to. background: None: black. A cameras.json
-    most of whose cameras see nothing of the scene is left aside with a warning. Raises InputError
-    for a damaged one.
+    most of whose cameras see nothing of the scene, and a damaged one, is left aside with a warning.
     """
     folder = source if source.is_dir() else source.parent
     folder = folder.parent.parent if iteration_of(folder) is not None else folder
     listed = folder / "cameras.json"
-    cameras = _read_cameras(listed, world.seen_from(origin)) if listed.is_file() else {}
-    kind = PHOTOGRAPHED
+    kind, cameras = PHOTOGRAPHED, {}
+    if listed.is_file():
+        try:
+            cameras = _read_cameras(listed, world.seen_from(origin))
+        except InputError as error:
+            log.warning("cameras.json is left aside: %s", error)
     if cameras and not _mostly_see(list(cameras.values()), positions):
         log.warning("%s is left aside: most of its cameras do not see the scene in %s", listed, source)
         cameras = {}

@@ -110,6 +110,9 @@ class Format:
     is_antialiased: Callable[[Path], bool] | None = None
     """is_antialiased(path): whether a file says that it is drawn with antialiasing. None: files do
     not say."""
+    read_note: Callable[[Path], Note] | None = None
+    """read_note(path): the note that `write` was given, without what had no room in the file; empty
+    for files of other programs. None: the format has no room for one."""
     needs: Callable[[], None] | None = None
     """needs(): raises InputError where a library that the writer needs is missing. It is called
     before a scene is baked."""

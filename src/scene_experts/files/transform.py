@@ -69,7 +69,7 @@ def read_transform(path: Path, capture: Capture) -> Similarity:
 
     path: JSON with `transform`, rows of a 3 x 4 matrix, and `scale`, as nerfstudio writes
     dataparser_transforms.json: a point p of the reconstruction is at scale * (transform p) in the
-    file. The poses of a capture may have been turned first (`Capture.applied`).
+    file. The poses of a capture may have been turned and scaled first (`Capture.applied`).
 
     Raises InputError for another file and for a matrix without a rotation.
     """
@@ -79,6 +79,10 @@ def read_transform(path: Path, capture: Capture) -> Similarity:
             raise Damaged("no transform; nerfstudio's is dataparser_transforms.json")
         scale = number(found.get("scale", 1.0), "the scale", 1e-15, FARTHEST)
         turn = _matrix(found["transform"])
+    if capture.applied_scale is not None:  # the file's scale is from the unit of the reconstruction
+        with guarding(capture.root, budget.JSON, "capture"):
+            scale /= number(capture.applied_scale, "applied_scale", 1e-15, FARTHEST)
+    with guarding(path, budget.JSON, "transform"):
         to_file = Similarity(turn.rotation, scale * turn.shift, scale)
     if capture.applied is None:
         return to_file.inverse

@@ -120,6 +120,8 @@ def reconstruct(
             say(warning)
         exhaustive = len(pairs) == every_pair([find_place(name) for name in names])
         note = describe_result(result, found, options, time.monotonic() - began, copied=not own, exhaustive=exhaustive)
+        if not own:
+            note[work.FILES] = sorted(path.relative_to(images).as_posix() for path in images.rglob("*") if path.is_file())
         write_facts(Path(request["model"]), images, rig, result, note, folder / work.DONE / NOTE)
         work.publish(out)
     shutil.rmtree(out / work.NAME, ignore_errors=True)

@@ -40,7 +40,14 @@ def test_a_capture_and_the_next_command(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("scene_experts.sfm.reconstruct.run_worker", fake_worker(**said))
     assert cli.main(["capture", str(write_black(tmp_path / "photos")), "--out", str(tmp_path / "box")]) == 0
     out = capsys.readouterr().out
-    assert "3 photographs" in out and f"scene-experts train {PROPOSED} --data {tmp_path / 'box'} --out RUN" in out
+    assert "3 photographs" in out and f"scene-experts train {PROPOSED} --data {tmp_path / 'box'} --out RUN" in out and "--model" not in out
+    (tmp_path / "box/sparse/1").mkdir()
+    (tmp_path / "box/sparse/1/images.txt").write_text("")
+    assert cli.main(["capture", str(tmp_path / "photos"), "--out", str(tmp_path / "box"), "--overwrite"]) == 0
+    out = capsys.readouterr().out
+    assert (
+        "also holds 1 of another reconstruction" in out and "--model sparse/0" in out and (tmp_path / "box/sparse/1/images.txt").is_file()
+    )
 
 
 def test_unusable_input_is_told(tmp_path, capsys):

@@ -54,3 +54,11 @@ def test_captures_without_maps_or_points_are_not_changed(tmp_path):
         assert check_depths(other) is other
     bare = replace(capture, views=tuple(replace(v, depth=None) for v in capture.views))
     assert check_depths(bare) is bare
+
+
+def test_maps_that_cannot_be_read_are_left_out_and_told(tmp_path):
+    folder = make_depths(tmp_path / "planes", cloud=True)
+    (folder / "depth/1.png").write_bytes(b"no picture")
+    capture = load(folder)
+    assert summarise(capture)["depth_maps"] == 4 and capture.depth(1) is None
+    assert [w for w in capture.warnings if w.startswith("1 of 5 depth maps are left out (first: ") and "1.png" in w]

@@ -104,6 +104,10 @@ def test_flags_that_do_not_fit_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="--hub"):
         hub.write_hub(None, tmp_path / "file")  # type: ignore[arg-type]
+    (tmp_path / hub.CARD).write_text("my own words")
+    with pytest.raises(InputError, match=r"README\.md"):
+        hub.write_hub(None, tmp_path)  # type: ignore[arg-type]
+    assert (tmp_path / hub.CARD).read_text() == "my own words"
 
 
 @pytest.mark.slow

@@ -61,12 +61,15 @@ def test_the_map_of_nerfstudio(tmp_path: Path) -> None:
     have been turned."""
     R, t, p = turn(), random(3), random(3)
     path = written(tmp_path / "d.json", {"transform": torch.cat((R, t[:, None]), 1).tolist(), "scale": 0.25})
-    capture: Any = SimpleNamespace(root=tmp_path, applied=None)
+    capture: Any = SimpleNamespace(root=tmp_path, applied=None, applied_scale=None)
     back = read_transform(path, capture)
     torch.testing.assert_close(back.scale * back.rotation @ (0.25 * (R @ p + t)) + back.shift, p)
     capture.applied = [[0, 1, 0, 0], [1, 0, 0, 2], [0, 0, -1, 0]]
     back = read_transform(path, capture)
     torch.testing.assert_close(back.scale * back.rotation @ (0.25 * (R @ p + t)) + back.shift, torch.stack((p[1], p[0] + 2, -p[2])))
+    capture.applied, capture.applied_scale = None, 2.0  # the capture's unit is half that of the reconstruction, and so are its poses
+    back = read_transform(path, capture)
+    torch.testing.assert_close(back.scale * back.rotation @ (0.25 / 2 * (R @ p + t)) + back.shift, p)
 
 
 BAD = (

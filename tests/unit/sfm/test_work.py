@@ -5,6 +5,7 @@ from contextlib import suppress
 import pytest
 
 from scene_experts.core.errors import InputError
+from scene_experts.core.io import write_json
 from scene_experts.sfm import work
 from support.messages import naming
 
@@ -77,3 +78,33 @@ def test_a_call_that_wrote_nothing_leaves_no_folder(tmp_path):
         (folder / "database").mkdir()
         raise ValueError
     assert (folder / "database").is_dir()  # to continue from
+
+
+def test_files_of_the_user_stay(tmp_path):
+    for again in (False, True):
+        with work.open_work_folder(tmp_path) as desk:
+            done = desk / work.DONE
+            (done / "images/a").mkdir(parents=True)
+            (done / "model").mkdir()
+            for name in ("images/a/1.jpg", "images/a/1_mask.png", "model/points3D.bin") + (() if again else ("images/2.jpg",)):
+                (done / name).write_text("new" if again else "old")
+            files = sorted(p.relative_to(done / "images").as_posix() for p in (done / "images").rglob("*") if p.is_file())
+            write_json(done / "capture.json", {work.FILES: files})
+            work.publish(tmp_path)
+        if not again:
+            for name in ("images/2_mask.png", "images/notes.txt", "images/extra.jpg", "sparse/0/test.txt"):
+                (tmp_path / name).write_text("mine")
+    for name in ("images/2_mask.png", "images/notes.txt", "images/extra.jpg", "sparse/0/test.txt"):
+        assert (tmp_path / name).read_text() == "mine"
+    for name in ("images/a/1.jpg", "images/a/1_mask.png", "sparse/0/points3D.bin"):
+        assert (tmp_path / name).read_text() == "new"
+    assert not (tmp_path / "images/2.jpg").exists()
+
+
+def test_masks_stay_where_a_capture_has_no_list_of_its_copies(tmp_path):
+    old, new = tmp_path / "old", tmp_path / "new"
+    (old / "b").mkdir(parents=True)
+    for name in ("1.jpg", "b/1_mask.png", "notes.txt"):
+        (old / name).write_text("")
+    work.keep_others(old, new, work.is_copy)
+    assert sorted(p.relative_to(new).as_posix() for p in new.rglob("*") if p.is_file()) == ["b/1_mask.png", "notes.txt"]

@@ -46,20 +46,19 @@ class NerfstudioReader:
         names: list[str] = []
         unmasked: list[str] = []
         undeep: list[str] = []
-        for index, frame in enumerate(meta["frames"]):
-            stated = transforms.read_file_path(frame, index, path)
-            name, image = transforms.find_image(folder, stated, options.images)
+        paths = [transforms.read_file_path(frame, index, path) for index, frame in enumerate(meta["frames"])]
+        files = transforms.find_images(folder, paths, options.images, warnings)
+        for frame, stated, (name, image) in zip(meta["frames"], paths, files):
             lens = transforms.read_lens(meta, frame, path, image)
-            given = folder / str(frame["mask_path"]) if frame.get("mask_path") else None
-            mask = given if given and given.is_file() else None
-            if given and image and not mask:
+            mask = transforms.find_beside(folder, frame.get("mask_path"))
+            if frame.get("mask_path") and image and not mask:
                 unmasked.append(str(frame["mask_path"]))
             angle = transforms.read_angle(meta, frame, path) if lens is None else 0.0
             pose = transforms.read_pose(frame, path)
             names.append(name)
-            depth = folder / str(frame["depth_file_path"]) if frame.get("depth_file_path") else None
-            if depth is not None and not depth.is_file():
-                undeep, depth = [*undeep, str(frame["depth_file_path"])], None
+            depth = transforms.find_beside(folder, frame.get("depth_file_path"))
+            if frame.get("depth_file_path") and depth is None:
+                undeep.append(str(frame["depth_file_path"]))
             held_out, file = transforms.to_pure(stated) in held, None if depth is None else DepthFile(depth, MILLI)
             images.append(image and PosedImage(name, image, lens, pose, mask, angle, held_out, file))
         kept = transforms.drop_absent(folder, images, names, warnings)
@@ -69,7 +68,15 @@ class NerfstudioReader:
             warnings.append(f"{len(undeep)} depth maps that transforms.json names are absent (first: {undeep[0]}); restore them")
         points, cloud = transforms.read_points(folder, meta.get("ply_file_path"), warnings) if options.points else (None, None)
         source = "the file that ply_file_path names, or pointcloud.ply,"
-        return RawCapture(kept, points, warnings, points_source=source, cloud=cloud, applied=meta.get("applied_transform"))
+        return RawCapture(
+            kept,
+            points,
+            warnings,
+            points_source=source,
+            cloud=cloud,
+            applied=meta.get("applied_transform"),
+            applied_scale=meta.get("applied_scale"),
+        )
 
 
 def _held_out(meta: dict[str, Any], path: Path, warnings: list[str]) -> set[PurePosixPath]:

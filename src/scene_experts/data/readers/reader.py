@@ -59,6 +59,7 @@ class RawCapture:
     cloud: Path | None = None  # the file of points, if nothing says that its frame is that of the cameras
     model: Path | None = None  # folder of the reconstruction, if it is not that of the capture
     applied: object = None  # rows of the 3x4 matrix that turned the reconstruction into this frame, as the files state it; None: none
+    applied_scale: object = None  # factor of the reconstruction's unit, as the files state it; None: 1
     bounds: tuple[Vector, Vector] | None = None  # lower and upper corner of the scene; random points fill it if there are none
 
 

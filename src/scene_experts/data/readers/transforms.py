@@ -22,7 +22,7 @@ from scene_experts.core.reading.source import describe, shorten
 from scene_experts.core.types import Points
 from scene_experts.data.images import probe
 from scene_experts.data.lens import Lens
-from scene_experts.data.match import EXTENSIONS, find_file
+from scene_experts.data.match import EXTENSIONS, find_file, match_images
 from scene_experts.data.points import find_cloud
 from scene_experts.data.points import read_points as read_cloud
 from scene_experts.data.readers.reader import PosedImage
@@ -82,6 +82,37 @@ def find_image(root: Path, file_path: str, images: str | None) -> tuple[str, Pat
         if path := find_file(root, candidate):
             return candidate, path
     return name, None
+
+
+def find_images(root: Path, file_paths: Sequence[str], images: str | None, warnings: list[str]) -> list[tuple[str, Path | None]]:
+    """Return the name and the file of each view, as `find_image` does, and add warnings about
+    files that are not called as stated.
+
+    What is absent is looked for in the first folder of its path, or in `images`, under other
+    extensions and in other folders, as `match_images` does.
+    """
+    found = [find_image(root, path, images) for path in file_paths]
+    usual = images or "images"
+    rest: dict[str, list[tuple[int, str]]] = {}
+    for index, name in ((index, name) for index, (name, path) in enumerate(found) if path is None):
+        first, _, inner = name.partition("/")
+        inside = inner and first and (root / first).is_dir()
+        rest.setdefault(first if inside else usual, []).append((index, inner if inside else name))
+    for folder, names in rest.items():
+        if not (root / folder).is_dir():
+            continue
+        matched = match_images(root / folder, [name for _, name in names])
+        warnings += matched.warnings
+        for index, name in names:
+            if name in matched.found:
+                file = matched.found[name]
+                found[index] = file.relative_to(root).as_posix(), file
+    return found
+
+
+def find_beside(root: Path, named: object) -> Path | None:
+    """Return the file that a frame names beside its photograph (a mask, a depth map), or None."""
+    return find_file(root, str(to_pure(str(named)))) if named else None
 
 
 def drop_absent(root: Path, images: Sequence[PosedImage | None], names: Sequence[str], warnings: list[str]) -> list[PosedImage]:
@@ -155,12 +186,12 @@ def read_lens(meta: dict[str, Any], frame: dict[str, Any], path: Path, image: Pa
         p = [float(both.get(f"p{i}", 0.0) or 0.0) for i in (1, 2)]
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"expected numbers as w, h, fl_x, fl_y, cx and cy in {path}, found {describe(error)}; restore the file") from None
-    if k[3] and not any(k[4:]) and model not in (*_PINHOLES, "OPENCV_FISHEYE", "FULL_OPENCV"):
+    if k[3] and not any(k[4:]) and model not in ("OPENCV_FISHEYE", "FULL_OPENCV"):
         raise InputError(
             f"expected no k4 beside camera_model {model} in {path}, found {k[3]:g}, which programs use in different ways; fit the lens "
             f"without k4, or write FULL_OPENCV if it is that of OpenCV"
         )
-    if model in _PINHOLES:
+    if model in _PINHOLES and not any((*k, *p)):  # nerfstudio reads k and p whatever the model is called
         lens = Lens("PINHOLE", width, height, (fx, fy, cx, cy))
     elif model == "OPENCV_FISHEYE":
         lens = Lens(model, width, height, (fx, fy, cx, cy, *k[:4]))
@@ -189,8 +220,8 @@ def read_points(root: Path, named: object, warnings: list[str]) -> tuple[Points 
 
     Raises InputError if the named file is absent or the file is damaged.
     """
-    path = root / named if isinstance(named, str) else find_cloud([root], warnings)
-    if path is not None and not path.is_file():
-        raise InputError(f"expected the points of {root} in {shorten(str(named))}, found no such file; restore it or give --points FILE")
+    path = find_file(root, str(to_pure(named))) if isinstance(named, str) else find_cloud([root], warnings)
+    if path is None and isinstance(named, str):
+        raise InputError(f"expected the points of {root} in {shorten(named)}, found no such file; restore it or give --points FILE")
     points = None if path is None else read_cloud(path, warnings)
     return points, None if isinstance(named, str) else path

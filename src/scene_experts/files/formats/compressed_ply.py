@@ -32,7 +32,7 @@ from scene_experts.files.formats.pack import (
     to_bytes,
     unit_quats,
 )
-from scene_experts.files.formats.ply import header, is_antialiased, note_comments
+from scene_experts.files.formats.ply import header, is_antialiased, note_comments, read_note
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.registry import Format
 from scene_experts.geometry.sh import C0
@@ -193,4 +193,5 @@ FORMAT = Format(
     other_suffixes=(".ply",),
     antialias=True,
     is_antialiased=is_antialiased,
+    read_note=read_note,
 )

@@ -86,6 +86,15 @@ def write(path: Path, splats: Splats, note: dict[str, Any]) -> None:
     write_bytes(path, struct.pack("<III", MAGIC, 2, 12 + len(chunks)) + chunks)
 
 
+def read_note(path: Path) -> dict[str, Any]:
+    """The note in a file of ours. Raises InputError for a damaged file."""
+    with opening(path, budget.GLB) as source:
+        found: Any = GltfFile(source).scene
+        for name in ("asset", "extras", "scene-experts"):
+            found = found.get(name) if isinstance(found, dict) else None
+        return found if isinstance(found, dict) else {}
+
+
 def read(path: Path) -> Splats:
     """The Gaussians of all primitives with the extension, together. Transforms of nodes are not
     applied, and colours of another space are not converted; a warning tells of them.
@@ -207,6 +216,7 @@ FORMAT = Format(
     suffix=".glb",
     write=write,
     read=read,
+    read_note=read_note,
     marks=(b"glTF", *JSON_STARTS),
     looks_like=looks_like,
 )

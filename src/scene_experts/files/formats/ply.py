@@ -247,4 +247,5 @@ FORMAT = Format(
     looks_like=lambda path, head: b"\nelement chunk " not in header(path),
     antialias=True,
     is_antialiased=is_antialiased,
+    read_note=read_note,
 )

@@ -125,6 +125,14 @@ def is_antialiased(path: Path) -> bool:
         return meta.get("antialias") is True
 
 
+def read_note(path: Path) -> dict[str, Any]:
+    """The note in a file of ours. Raises InputError for a damaged file."""
+    with _opened(path) as (_, meta, _):
+        asset = meta.get("asset")
+        note = asset.get("scene-experts") if isinstance(asset, dict) else None
+        return note if isinstance(note, dict) else {}
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Source, Any, Part]]:
     """The description in a zip or in a meta.json, and what returns the files that it names."""
@@ -306,4 +314,5 @@ FORMAT = Format(
     looks_like=looks_like,
     antialias=True,
     is_antialiased=is_antialiased,
+    read_note=read_note,
 )

@@ -25,6 +25,7 @@ from scene_experts.core.extras import install_line
 from scene_experts.core.io import write_atomic
 from scene_experts.core.reading import budget
 from scene_experts.core.reading.budget import Damaged
+from scene_experts.core.reading.plain import parse_json
 from scene_experts.core.reading.source import Source, opening, shorten
 from scene_experts.core.version import package_folders
 from scene_experts.files.formats.pack import (
@@ -82,10 +83,14 @@ def read(path: Path) -> Splats:
     with opening(path, budget.USD) as source, tempfile.TemporaryDirectory(prefix="scene-experts-usd-") as folder:
         expect_library()
         archive, seconds = Path(folder) / "arrays.npz", int(budget.USD.time_limit(source.size)) + 1
-        # usd-core goes by the suffix; a layer that is named .usd may be binary or text
-        named = Path(folder) / "scene.usd"
-        named.symlink_to(path.absolute()) if hasattr(os, "symlink") and os.name != "nt" else named.write_bytes(source.read())
-        done = _work("read", named, archive, _STARTING + 10 * seconds, str(_LOADED + budget.USD.allowance(source.size)), str(seconds))
+        done = _work(
+            "read",
+            _named(path, source, Path(folder)),
+            archive,
+            _STARTING + 10 * seconds,
+            str(_LOADED + budget.USD.allowance(source.size)),
+            str(seconds),
+        )
         if done.returncode == DAMAGED:
             raise Damaged(shorten(done.stdout))
         if done.returncode or not archive.is_file():
@@ -103,6 +108,26 @@ def read(path: Path) -> Splats:
         sh = np.concatenate([part[4][:, :coefficients] for part in found])
         stored = Splats(tensor(means), tensor(np.log(np.maximum(scales, 1e-30))), tensor(quats), tensor(logits(opacity)), tensor(sh))
         return turn(stored, "x").checked(path)
+
+
+def read_note(path: Path) -> dict[str, Any]:
+    """The note in a file of ours. Raises InputError as `read` does."""
+    with opening(path, budget.USD) as source, tempfile.TemporaryDirectory(prefix="scene-experts-usd-") as folder:
+        expect_library()
+        seconds = int(budget.USD.time_limit(source.size)) + 1
+        limits = (str(_LOADED + budget.USD.allowance(source.size)), str(seconds))
+        done = _work("note", _named(path, source, Path(folder)), Path(folder), _STARTING + 10 * seconds, *limits)
+        text = done.stdout.strip()
+        found = parse_json(text, budget.NOTE) if done.returncode == 0 and text else {}
+        return found if isinstance(found, dict) else {}
+
+
+def _named(path: Path, source: Source, folder: Path) -> Path:
+    """A file as one that is named .usd in `folder`: usd-core goes by the suffix, and a layer of that
+    name may be binary or text."""
+    named = folder / "scene.usd"
+    named.symlink_to(path.absolute()) if hasattr(os, "symlink") and os.name != "nt" else named.write_bytes(source.read())
+    return named
 
 
 def expect_library() -> None:
@@ -149,6 +174,7 @@ FORMAT = Format(
     other_suffixes=(".usda", ".usd"),
     write=write,
     read=read,
+    read_note=read_note,
     marks=(b"PXR-USDC", b"#usda"),
     needs=expect_library,
 )

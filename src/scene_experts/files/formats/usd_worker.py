@@ -85,6 +85,13 @@ def read(source: Path, target: Path) -> str | None:
     return None
 
 
+def read_note(source: Path) -> str:
+    """The note of a layer (JSON text); empty where it has none."""
+    layer = _pxr("Sdf").Layer.OpenAsAnonymous(str(source), metadataOnly=True)
+    found = {} if layer is None else dict(layer.customLayerData)
+    return str(found.get("scene-experts", ""))
+
+
 def _with_parents(layer: Any, spec: Any) -> Iterator[Any]:
     """A prim and the prims above it."""
     path = spec.path
@@ -146,6 +153,9 @@ def main(args: list[str]) -> int:
         return MISSING
     if limits:
         limit(*map(int, limits))
+    if task == "note":
+        print(read_note(Path(source)))
+        return 0
     wrong = read(Path(source), Path(target)) if task == "read" else write(Path(source), Path(target))
     if wrong:
         print(wrong)

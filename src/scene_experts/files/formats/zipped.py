@@ -14,7 +14,7 @@ from scene_experts.core.reading.archives import open_zip
 from scene_experts.core.reading.budget import Damaged
 from scene_experts.core.reading.source import opening, shorten
 from scene_experts.files.formats.splats import Splats
-from scene_experts.files.registry import GAUSSIANS, Format, recognise
+from scene_experts.files.registry import GAUSSIANS, Format, Note, recognise
 
 SCENES = (".ply", ".splat", ".ksplat", ".spz", ".sog", ".glb")
 _PLAIN = ("ply", "splat", "ksplat")  # formats that a zip makes much smaller; others take more memory per byte
@@ -36,6 +36,12 @@ def is_antialiased(path: Path) -> bool:
     `read` does."""
     with _unpacked(path) as (inner, format):
         return format.is_antialiased is not None and format.is_antialiased(inner)
+
+
+def read_note(path: Path) -> Note:
+    """The note of the scene in a zip. Raises InputError as `read` does."""
+    with _unpacked(path) as (inner, format):
+        return {} if format.read_note is None else format.read_note(inner)
 
 
 @contextmanager
@@ -69,4 +75,4 @@ def _unpacked(path: Path) -> Iterator[tuple[Path, Format]]:
             raise InputError(str(error).replace(str(inner), f"{path} ({base})")) from error
 
 
-FORMAT = Format(suffix=".zip", read=read, marks=(b"PK\x03\x04",), is_antialiased=is_antialiased)
+FORMAT = Format(suffix=".zip", read=read, marks=(b"PK\x03\x04",), is_antialiased=is_antialiased, read_note=read_note)

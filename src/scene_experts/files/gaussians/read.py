@@ -22,11 +22,11 @@ from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
 from scene_experts.data.views import Capture, Vector, World
 from scene_experts.files import result_folder
-from scene_experts.files.formats.ply import has_gaussians, property_names, read_note
+from scene_experts.files.formats.ply import has_gaussians, property_names
 from scene_experts.files.formats.splats import Splats
 from scene_experts.files.gaussians.write import KIND
 from scene_experts.files.placed import place_cameras
-from scene_experts.files.registry import Imported, recognise
+from scene_experts.files.registry import Imported, recognise, scene_file
 from scene_experts.files.registry import read as read_file
 from scene_experts.files.scene_folder import tell_origin
 from scene_experts.files.transform import read_transform
@@ -115,13 +115,22 @@ def file_world(source: Path, splats: Splats, capture: Capture) -> World:
 
 def noted_origin(source: Path) -> Vector | None:
     """The origin that the description of the result folder of a file, the one beside it (FILE.json)
-    or the note of a PLY states; None where none does."""
-    note = read_note(source) if source.suffix == ".ply" else {}
-    for about in (result_folder.read_description(source.parent) or {}, beside(source), note):
+    or the note in it states; None where none does."""
+    places = (lambda: result_folder.read_description(source.parent) or {}, lambda: beside(source), lambda: note_in(source))
+    for about in (place() for place in places):
         if "origin" in about:
             with guarding(source, budget.JSON, "description of a file"):
                 return result_folder.origin_in(about)
     return None
+
+
+def note_in(source: Path) -> dict[str, Any]:
+    """The note on how a file was made that the file itself holds; empty where there is none."""
+    path = scene_file(source)
+    if not path.is_file():
+        return {}
+    format = recognise(path)[1]
+    return {} if format.read_note is None else format.read_note(path)
 
 
 def far_origin(splats: Splats) -> Vector:

@@ -15,6 +15,7 @@ from scene_experts.data.lens import Lens
 from scene_experts.data.readers.colmap_model import write_model
 from scene_experts.data.summary import summarise
 from support.captures import load
+from support.depths import make_depths
 from support.lenses import LENSES
 from support.synthetic import make_capture, make_nerfstudio, picture
 
@@ -144,3 +145,43 @@ def test_auto_uses_the_split_that_the_file_states(tmp_path: Path) -> None:
     edit(tmp_path / "transforms.json", lambda m: m.pop("test_filenames"))
     with pytest.raises(InputError, match=r"--split files.*nerfstudio"):
         load(tmp_path, split="files")
+
+
+@pytest.mark.parametrize(
+    "elsewhere", [lambda name: f"images/{name[:-4]}.JPG", lambda name: f"C:\\data\\images\\{name}", lambda name: f"/no/such/{name}"]
+)
+def test_photographs_that_are_called_otherwise_are_found_and_told(tmp_path: Path, elsewhere) -> None:
+    make_nerfstudio(tmp_path, views=3, size=(24, 16), points=50)
+    (tmp_path / "depth").mkdir()
+    for path in (tmp_path / "images").iterdir():  # of the same names: not the photographs
+        Image.fromarray(np.zeros((16, 24), np.uint8)).save(tmp_path / "depth" / path.name)
+    plain = load(tmp_path)
+    edit(tmp_path / "transforms.json", lambda m: [f.update(file_path=elsewhere(Path(f["file_path"]).name)) for f in m["frames"]])
+    capture = load(tmp_path)
+    assert [v.name for v in capture.views] == [v.name for v in plain.views] and [v.path for v in capture.views] == [
+        v.path for v in plain.views
+    ]
+    assert any(w.startswith("3 images") for w in capture.warnings)
+
+
+def test_files_beside_photographs_may_have_paths_of_windows(tmp_path: Path) -> None:
+    make_depths(tmp_path, cloud=True)
+    (tmp_path / "stencils").mkdir()
+    (tmp_path / "cloud.ply").rename(tmp_path / "stencils/cloud.ply")
+    Image.fromarray(np.zeros((48, 64), np.uint8)).save(tmp_path / "stencils/0.png")
+
+    def change(meta) -> None:
+        meta.update(ply_file_path="stencils\\cloud.ply")
+        meta["frames"][0].update(mask_path="stencils\\0.png", depth_file_path="depth\\0.png")
+
+    edit(tmp_path / "transforms.json", change)
+    capture = load(tmp_path)
+    assert not any("absent" in warning for warning in capture.warnings)
+    assert capture.frame(0).mask is not None and capture.views[0].depth is not None and capture.points is not None
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE"])
+def test_distortion_counts_whatever_the_lens_is_called(tmp_path: Path, model: str) -> None:
+    make_nerfstudio(tmp_path, views=3, size=(96, 64), points=50, distortion=LENSES[4])
+    edit(tmp_path / "transforms.json", lambda m: [f.update(camera_model=model) for f in (m, *m["frames"])])
+    assert summarise(load(tmp_path))["undistorted"] == 3

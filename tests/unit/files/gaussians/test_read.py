@@ -1,6 +1,7 @@
 """Explicit Gaussians through 3DGS's file and back: the same picture, in the capture's own frame."""
 
 import json
+import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from scene_experts.files import registry
 from scene_experts.files.export import export
 from scene_experts.files.formats import ply, splat
 from scene_experts.files.formats.ply import read_vertices, write_vertices
+from scene_experts.files.gaussians.read import noted_origin
 from scene_experts.files.importing import import_files
 from scene_experts.files.options import Options
 from scene_experts.files.result_folder import read_settings
@@ -27,6 +29,7 @@ from scene_experts.training.recipes import RECIPES
 from support.captures import load
 from support.files import export_run
 from support.messages import naming
+from support.splats import splats
 from support.synthetic import make_capture
 
 
@@ -187,3 +190,21 @@ def test_formats_that_do_not_fit_are_refused_in_one_sentence(made, tmp_path):
     write_vertices(tmp_path / "bad.ply", columns)
     with pytest.raises(InputError, match=naming("opacity_logit", "bad.ply")):
         import_files(tmp_path / "bad.ply", Data(folder), tmp_path / "again")
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.PLY", "a.compressed.ply", "a.zip", "a.sog", "a.glb", "a.usdc", "a.usda"])
+def test_a_file_alone_tells_its_origin(name, tmp_path):
+    if "usd" in name:
+        pytest.importorskip("pxr")
+    path = tmp_path / name
+    formats = {".zip": "ply", ".PLY": "ply", ".ply": "ply", ".usda": "usd", ".usdc": "usd"}
+    format = registry.format_named("compressed-ply" if "compressed" in name else formats.get(path.suffix, path.suffix[1:]))
+    target = tmp_path / "inner.ply" if name in ("a.zip", "a.PLY") else path
+    format.write(target, splats(20), {"origin": [448250.0, 5411932.0, 340.0], "antialias": False})
+    if name == "a.PLY":
+        target.rename(path)
+    if name == "a.zip":
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.write(target, "inner.ply")
+        target.unlink()
+    assert noted_origin(path) == (448250.0, 5411932.0, 340.0)
