@@ -190,7 +190,7 @@ def parts_of(value: Any) -> Iterator[Any]:
 def find_own_scenes(captures: Sequence[Path]) -> list[CaptureSpec]:
     """Return the user's captures as scenes of one data set. Raises InputError where a folder is
     missing or two have the same name."""
-    scenes = [CaptureSpec(path.resolve().name, OWN, path) for path in captures]
+    scenes = [CaptureSpec(captures_.name_capture(path), OWN, path) for path in captures]
     for scene in scenes:
         if not scene.path.is_dir():
             raise InputError(f"expected a capture folder at {scene.path}, found none; correct --captures")

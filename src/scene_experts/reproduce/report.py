@@ -165,4 +165,4 @@ def adopt(run: Path, folder: Path) -> Path:
     """Write the record of a run folder that another command trained. Its scene is the name of its
     capture."""
     config = run_folder.read_config(run)
-    return store.write(folder, store.read_run(run, Path(config.data.path).resolve().name, code_of(config.train)))
+    return store.write(folder, store.read_run(run, captures.name_capture(Path(config.data.path)), code_of(config.train)))

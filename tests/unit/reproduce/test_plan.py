@@ -117,6 +117,9 @@ def test_own_captures_need_folders_and_names_of_their_own(tmp_path):
     (tmp_path / "a" / "fox").mkdir(parents=True)
     (tmp_path / "b" / "fox").mkdir(parents=True)
     assert find_own_scenes([tmp_path / "a" / "fox"])[0].name == "fox"
+    for name in ("one", "two"):  # as `make` calls them
+        (tmp_path / name / "capture").mkdir(parents=True)
+    assert [scene.name for scene in find_own_scenes([tmp_path / "one/capture", tmp_path / "two/capture"])] == ["one", "two"]
     with pytest.raises(InputError, match="fox"):
         find_own_scenes([tmp_path / "a" / "fox", tmp_path / "b" / "fox"])
     with pytest.raises(InputError, match="--captures"):
