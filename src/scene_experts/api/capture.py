@@ -247,7 +247,8 @@ def load_capture(
             Everything that the API returns is in the capture's own unit either way.
         init: Start from the capture's 3D "points", from "dense" ones that a training computes from
             its photographs, or from "random" ones. "auto": "dense" where the recipe asks for it
-            (`dense_views`), else "points".
+            (`dense_views`), else "points", with some far away where it asks for them
+            (`far_points`).
         points: File of points to start from instead: PLY, or COLMAP's points3D.bin or points3D.txt,
             in the frame of the capture's poses.
         model: Which reconstruction of the capture is read if it has several: a folder ("sparse/1")

@@ -54,9 +54,7 @@ def capture(args: list[str]) -> int:
     data = Data(command.out)
     if others := [place.name for place in find_models(command.out) if place != command.out / PLACES["model"]]:
         data = replace(data, model=PLACES["model"])
-        say(
-            f"{command.out / 'sparse'} also holds {', '.join(others)} of another reconstruction, left as it is; --model chooses"
-        )
+        say(f"{command.out / 'sparse'} also holds {', '.join(others)} of another reconstruction, left as it is; --model chooses")
     say(propose_training(data, width, height, note["with_pose"]))
     return 0
 

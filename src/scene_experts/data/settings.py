@@ -42,7 +42,7 @@ class Data:
     init: Literal["auto", "points", "dense", "random"] = "auto"
     """Start from the capture's 3D points, from denser ones that are computed from the training
     photographs (dense), or from random points. auto: dense where the recipe asks for it
-    (--dense-views), else points."""
+    (--dense-views), else points, with some far away where it asks for them (--far-points)."""
     points: Annotated[Path | None, Option(value="FILE")] = None
     """Start from the points of this file instead: a PLY file, or points3D.bin or points3D.txt of
     COLMAP, in the frame of the capture's poses."""

@@ -85,6 +85,7 @@ def _for_photographs(name: str) -> Train:
         loss=replace(plain.loss, depth=0.2),
         half_until=AFTER_GROWTH[0],
         dense_views=FEW,
+        far_points=5.0,
         mean_background=True,
         near_share=0.5,
         random_background=True,

@@ -12,6 +12,7 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.data.capture import Capture
 from scene_experts.data.dense import NoDenseStartError, start_densely
+from scene_experts.data.far import add_far_points
 from scene_experts.data.settings import Data
 from scene_experts.training.adjusted import adjust_to_tracks
 from scene_experts.training.config import Train, find_unused
@@ -82,15 +83,28 @@ def _start(cfg: Train, data: Data, capture: Capture, device: str, dtype: torch.d
     few = len(capture.train) <= cfg.dense_views and (capture.points is None or len(capture.points.xyz) < ENOUGH)
     by_recipe = few and data.init == "auto" and data.points is None and not capture.random_points
     if data.init != "dense" and not by_recipe:
-        return Training.start(cfg, capture, device, dtype)
+        return _start_far(cfg, data, capture, device, dtype)
     try:
         found = start_densely(capture, cfg.growth.max_anchors)
     except NoDenseStartError as error:
         if not by_recipe:
             raise
-        training = Training.start(cfg, capture, device, dtype)
-        training.computed = f"the capture's points; a plane sweep finds no denser ones: it needs {error.expected} and found {error.why}"
+        training = _start_far(cfg, data, capture, device, dtype)
+        about = f"the capture's points; a plane sweep finds no denser ones: it needs {error.expected} and found {error.why}"
+        training.computed = "; ".join(part for part in (about, training.computed) if part)
         return training
     training = Training.start(cfg, replace(capture, points=found.points), device, dtype)
     training.computed = found.describe() + ("; --init points starts from the capture's own" if by_recipe else "")
+    return training
+
+
+def _start_far(cfg: Train, data: Data, capture: Capture, device: str, dtype: torch.dtype) -> Training:
+    """Start a training from the capture's points, and from points far away where the recipe asks
+    for them."""
+    wanted = cfg.far_points > 0 and data.init == "auto" and not capture.random_points
+    found = add_far_points(capture, cfg.far_points) if wanted else None
+    if found is None:
+        return Training.start(cfg, capture, device, dtype)
+    training = Training.start(cfg, replace(capture, points=found.points), device, dtype)
+    training.computed = f"{found.describe()}; --init points starts from the capture's own alone"
     return training

@@ -8,15 +8,19 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Mode
+from scene_experts.data.far import add_far_points
+from scene_experts.data.settings import Data
 from scene_experts.native import library as native
 from scene_experts.render import choose
 from scene_experts.training.events import Finished, Stepped
 from scene_experts.training.losses import Weights, depth_error
+from scene_experts.training.start import start
 from scene_experts.training.state import resume
 from support.captures import load
 from support.depths import make_depths
 from support.lanes import slow_except
 from support.planes import hole, make_planes, plane
+from support.synthetic import make_capture
 from support.trainings import assert_same, config, events, last_tensors
 
 
@@ -89,3 +93,15 @@ def test_a_rate_that_leaves_little_of_the_scene_is_told(tmp_path, caplog):
     assert "--rate" not in caplog.text
     next(events(config("scaffold-gs", rate=100.0), folder, stop_at=1))
     assert "--rate 100 makes bits count so much" in caplog.text
+
+
+def test_far_points_are_added_where_the_recipe_asks_and_init_does_not_say_otherwise(tmp_path):
+    folder = make_capture(tmp_path / "box", views=9, size=(48, 32), points=40, mixed_sizes=False).folder
+    cfg, started = config("scaffold-gs", far_points=5.0), {}
+    for name, (recipe, init) in {"with": (cfg, "auto"), "points": (cfg, "points"), "none": (config("scaffold-gs"), "auto")}.items():
+        capture = load(folder)
+        started[name] = start(recipe.scaled(), Data(folder, init=init), capture, "cpu", torch.float32)
+    found = add_far_points(load(folder), 5.0)
+    assert found is not None and started["with"].computed == f"{found.describe()}; --init points starts from the capture's own alone"
+    assert started["points"].computed == started["none"].computed == ""
+    assert started["with"].scene.table.total > started["points"].scene.table.total == started["none"].scene.table.total
