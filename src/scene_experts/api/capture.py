@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
 from scene_experts.api import checked
@@ -18,6 +19,8 @@ from scene_experts.data.fetch.catalog import Numbers, defaults_of
 from scene_experts.data.settings import Data
 from scene_experts.training import run_folder
 from scene_experts.view import paths
+
+MOVED, TURNED = 0.05, 0.97  # share of how far cameras are apart, and cosine: more than poses are refined by
 
 
 class Capture:
@@ -105,11 +108,11 @@ class Capture:
         """The unit vector [3] that points upwards in the training pictures, on average."""
         return paths.analyse_cameras(self.loaded).up.numpy()
 
-    def photo(self, view: int | Camera) -> NDArray[np.float32]:
+    def photo(self, view: int | str | Camera) -> NDArray[np.float32]:
         """Return the photograph of a view, undistorted and at the resolution of its camera.
 
         Args:
-            view: Index of the view, or its camera.
+            view: Index of the view, its name, or its camera.
 
         Returns:
             [H, W, 3] float32, RGB in [0, 1].
@@ -119,7 +122,7 @@ class Capture:
         """
         return self.loaded.frame(self._index(view)).rgb.numpy().astype(np.float32) / np.float32(255)
 
-    def mask(self, view: int | Camera) -> NDArray[np.float32] | None:
+    def mask(self, view: int | str | Camera) -> NDArray[np.float32] | None:
         """Return the mask of a view.
 
         Args:
@@ -196,12 +199,32 @@ class Capture:
     def _cameras(self, indices: Sequence[int]) -> list[Camera]:
         return [from_trained(self.loaded.views[i].camera, self.loaded.world) for i in indices]
 
-    def _index(self, view: int | Camera) -> int:
-        index, count = view.view if isinstance(view, Camera) else view, len(self.loaded.views)
+    def _index(self, view: int | str | Camera) -> int:
+        if isinstance(view, str):
+            if view in self.names:
+                return self.names.index(view)
+            raise InputError(f"expected the name of a view of {self.name}, found {view!r}; choose one of `Capture.names`")
+        if not isinstance(view, (int, np.integer, Camera)):
+            raise InputError(
+                f"expected a view of {self.name} as an index, a name or a camera, found {view!r}; choose one of `Capture.cameras`"
+            )
+        index, count = int(view.view if isinstance(view, Camera) else view), len(self.loaded.views)
         if not 0 <= index < count:
             what = "a camera of no photograph" if isinstance(view, Camera) and index < 0 else str(index)
             raise InputError(f"expected a view from 0 to {count - 1} of {self.name}, found {what}; choose one of `Capture.cameras`")
+        if isinstance(view, Camera) and not self._took(index, view):
+            raise InputError(f"expected a camera of {self.name}, found one of a capture with other views; choose one of `Capture.cameras`")
         return index
+
+    def _took(self, index: int, camera: Camera) -> bool:
+        """Return whether a camera may have taken the photograph of a view: no other view is nearer
+        to its place, and it looks the same way. Refined poses differ a little."""
+        places = torch.stack([view.camera.position for view in self.loaded.views]).double()
+        away = (self.loaded.world.to_input(places) - torch.from_numpy(camera.position)).norm(dim=1)
+        forward = self.loaded.views[index].camera.world_to_cam[2, :3].double().numpy()
+        reach = max(float(away.max()), self.loaded.extent / self.loaded.world.scale)
+        near = float(away[index]) <= min(float(away.min()) + 1e-4 * reach, MOVED * reach)
+        return near and float(forward @ camera.world_to_camera[2, :3]) > TURNED
 
     def __repr__(self) -> str:
         train, test = len(self.loaded.train), len(self.loaded.test)
@@ -265,6 +288,8 @@ def load_capture(
     Raises:
         InputError: The folder holds no usable capture, or an argument is invalid.
     """
+    if not isinstance(path, (str, Path)):
+        raise InputError(f"expected the folder of a capture, found {path!r}; give its path")
     brought = defaults_of(path)
     cloud = None if points is None else Path(points)
     data = checked.fields(Data, {**locals(), "path": Path(path), "points": cloud, "normalise": normalise or brought.normalise})

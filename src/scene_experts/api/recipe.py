@@ -41,6 +41,8 @@ def recipe(name: str | Recipe, /, **numbers: Any) -> Recipe:
             range.
     """
     value = find_recipe(name) if isinstance(name, str) else name
+    if not isinstance(value, Recipe):
+        raise InputError(f"expected a recipe or its name, found {value!r}; `list_recipes()` names them all")
     for place, number in sorted(flat(numbers), key=lambda each: each[0].count(".")):  # a part before its numbers
         value = with_number(value, place.split("."), place, number, value)
     check(value)

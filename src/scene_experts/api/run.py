@@ -375,6 +375,8 @@ class Run:
     def _view(self, camera: Camera) -> tuple[types.Camera, Tensor]:
         """The camera in the trained world and the background, on the run's device."""
         capture = self.capture.loaded
+        if not isinstance(camera, Camera):
+            raise InputError(f"expected a camera, found {camera!r}; give for example one of `Run.test_cameras`")
         if camera.view >= len(capture.views):
             raise InputError(f"expected a camera of {capture.name}, found view {camera.view} of {len(capture.views)}; use another")
         view = to_trained(camera, capture.world, capture.views[0].camera.near)

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, fields
+from numbers import Real
 from pathlib import Path
 from statistics import fmean
 from time import monotonic
@@ -96,8 +97,10 @@ def make(
         InputError: The photographs cannot be used, or `out` holds something else.
         RunError: COLMAP fails, a loss is not finite, or a file cannot be written.
     """
-    if minutes is not None and not minutes > 0:
-        raise InputError(f"expected minutes above 0, found {minutes}; give for example 10")
+    if not isinstance(options, SourceOptions):
+        raise InputError(f"expected options as SourceOptions, found {options!r}; write for example SourceOptions(frames=30)")
+    if minutes is not None and not (isinstance(minutes, Real) and minutes > 0):
+        raise InputError(f"expected minutes above 0, found {minutes!r}; give for example 10")
     budget, source = TimeBudget(None if minutes is None else 60 * minutes), Path(source)
     folder = Path(out) if out is not None else Path(f"{name_source(source)}-scene")
     took: dict[str, float] = {}

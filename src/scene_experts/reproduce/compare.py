@@ -30,8 +30,12 @@ def make_comparison(options: ReproduceOptions) -> Experiment:
         raise InputError(
             f"expected two or more different --recipes with compare, found {', '.join(options.recipes) or 'none'}; change them"
         )
-    for line in lines:
-        read_line(line)
+    refined = [bool(read_line(line).refine_poses) for line in lines]
+    if any(refined) and not all(refined):
+        raise InputError(
+            "expected recipes that all refine poses or none, found some with --refine-poses: their held-out cameras are aligned with their "
+            "photographs before the scores, those of the others are not; score the runs with `eval --align-poses` and use `compare`"
+        )
     baselines = options.baseline or tuple(rows)[:1]
     for name in baselines:
         if name not in rows:

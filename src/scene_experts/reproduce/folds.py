@@ -12,6 +12,9 @@ from dataclasses import replace
 from statistics import fmean
 from typing import Any
 
+from scene_experts.core.errors import InputError
+from scene_experts.data import capture as captures
+from scene_experts.data.settings import Data
 from scene_experts.reproduce.plan import CaptureSpec
 from scene_experts.reproduce.store import MEANS, Record
 
@@ -25,6 +28,21 @@ def hold_out_each(scenes: Sequence[CaptureSpec], folds: int) -> list[CaptureSpec
     """Return each capture once for each fold."""
     splits = [split_of(fold, folds) for fold in range(1, folds + 1)]
     return [replace(scene, options={**scene.options, "split": split}) for scene in scenes for split in splits]
+
+
+def check_folds(scenes: Sequence[CaptureSpec], folds: int) -> None:
+    """Raise InputError for a capture with fewer photographs than folds, of which one would hold
+    none out."""
+    for scene in scenes:
+        try:
+            capture = captures.load(Data(scene.path), allow_no_points=True)
+        except InputError:
+            continue  # the runs say what is wrong
+        capture.images.close()
+        if (few := len(capture.views)) < folds:
+            raise InputError(
+                f"expected captures of at least {folds} photographs for --folds {folds}, found {few} in {scene.path}; give fewer"
+            )
 
 
 def join(records: Sequence[Record], folds: int) -> list[Record]:

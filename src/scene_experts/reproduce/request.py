@@ -11,7 +11,7 @@ from scene_experts.data.fetch import catalog
 from scene_experts.data.fetch.obtain import captures_dir
 from scene_experts.reproduce.compare import COMPARE, make_comparison
 from scene_experts.reproduce.experiments import EXPERIMENTS, OURS, Experiment
-from scene_experts.reproduce.folds import hold_out_each
+from scene_experts.reproduce.folds import check_folds, hold_out_each
 from scene_experts.reproduce.options import ReproduceOptions
 from scene_experts.reproduce.plan import (
     CaptureSpec,
@@ -55,6 +55,8 @@ def make_plan(options: ReproduceOptions) -> StudyPlan:
     chosen = choose_rows(chosen, tuple(split_name(text)[1] for text in options.recipes)) if options.recipes else chosen
     if not options.tables_only:
         check_folders(scenes)
+        if options.folds:
+            check_folds(scenes, options.folds)
     held_out = hold_out_each(scenes, options.folds) if options.folds else scenes
     shown = list_runs(chosen, held_out, options.seeds or (0,), scale)
     for spec in shown:

@@ -1,7 +1,7 @@
 """Records of finished runs: one JSON file a capture, with the configuration, results, scores by
 view and curves of each run.
 
-A record holds everything that the tables and figures need. It takes at most 8 kB, so it can be
+A record holds everything that the tables and figures need. It takes about 5 kB, so it can be
 committed where checkpoints cannot. Its configuration states what differs from the defaults
 (`core.plain.lean`).
 """

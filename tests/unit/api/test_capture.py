@@ -11,6 +11,7 @@ from PIL import Image
 import scene_experts as se
 from scene_experts.data.readers.colmap_model import read_model, write_model
 from support.messages import naming
+from support.synthetic import make_capture
 
 
 def test_a_capture_is_in_its_own_frame_and_unit(folder, capture):
@@ -138,3 +139,30 @@ def test_random_points_of_a_capture_without_points_follow_the_seed(folder, captu
 def test_a_resolution_that_is_no_text_is_refused():
     with pytest.raises(se.InputError, match="resolution"):
         se.load_capture("anywhere", resolution=64)  # type: ignore[arg-type]
+
+
+def test_a_camera_of_another_capture_has_no_photograph_here(tmp_path):
+    folder = make_capture(tmp_path / "c", views=12, mixed_sizes=False).folder
+    whole, six = se.load_capture(folder), se.load_capture(folder, max_views=6)
+    with pytest.raises(se.InputError, match="other views"):
+        whole.photo(six.cameras[3])
+    for i, camera in enumerate(whole.cameras):
+        assert np.array_equal(whole.photo(camera), whole.photo(i)) and np.array_equal(whole.photo(whole.names[i]), whole.photo(i))
+    assert np.array_equal(whole.photo(six.cameras[0]), six.photo(0))  # the same view of both
+    for wrong in ("none.png", None, 1.5):
+        with pytest.raises(se.InputError, match="Capture"):
+            whole.photo(wrong)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: se.load_capture(None),
+        lambda: se.recipe(None),
+        lambda: se.make("x", "y", minutes="10"),
+        lambda: se.make("x", "y", options={"frames": 30}),
+    ],
+)
+def test_arguments_of_another_kind_are_told_in_one_sentence(call):
+    with pytest.raises(se.InputError, match="expected"):
+        call()

@@ -1,6 +1,9 @@
 """Comparisons of any recipes: rows, baselines and the cells of their differences."""
 
-from scene_experts.reproduce.compare import make_comparison, make_difference_table, make_difference_tables
+import pytest
+
+from scene_experts.core.errors import InputError
+from scene_experts.reproduce.compare import COMPARE, make_comparison, make_difference_table, make_difference_tables
 from scene_experts.reproduce.experiments import DATASETS
 from scene_experts.reproduce.options import ReproduceOptions
 from support.records import record
@@ -28,3 +31,10 @@ def test_cells():
     ((name, *cells),) = table.rows
     assert name == "moe-gs" and cells[:4] == ["+0.10", "+0.20", "+0.30", "+0.20"] and cells[-1] == "-0.05 to +0.45"
     assert len(table.titles) == len(table.rows[0]) and "1 of the 2 seeds" in " ".join(table.notes)
+
+
+def test_recipes_that_refine_poses_are_not_compared_with_others_by_other_scores():
+    with pytest.raises(InputError, match="eval --align-poses"):
+        make_comparison(ReproduceOptions((COMPARE,), recipes=("scaffold-gs", "refined=scaffold-gs --refine-poses")))
+    both = ("a=scaffold-gs --refine-poses", "b=one-network --refine-poses")
+    assert list(make_comparison(ReproduceOptions((COMPARE,), recipes=both)).rows) == ["a", "b"]

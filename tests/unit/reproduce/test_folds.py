@@ -8,10 +8,11 @@ import pytest
 from scene_experts import cli
 from scene_experts.data.settings import Data
 from scene_experts.reproduce import store
-from scene_experts.reproduce.folds import find_incomplete, hold_out_each, join
+from scene_experts.reproduce.folds import check_folds, find_incomplete, hold_out_each, join
 from scene_experts.reproduce.plan import CaptureSpec
 from scene_experts.reproduce.statistics import difference
 from support.records import record
+from support.synthetic import make_capture
 
 
 def parts(recipe="moe-gs", folds=3, sizes=(2, 1, 1), psnr=30.0, **how):
@@ -65,3 +66,22 @@ def test_tables_of_folds(tmp_path, capsys):
     text = (tmp_path / "out" / "compare.md").read_text()
     assert "+1.00" in text and "33.00" in text  # 31 + (1 + 2 + 2 + 3) / 4 = 33
     assert "--folds 3" in (tmp_path / "out" / "README.md").read_text()
+
+
+def test_more_folds_than_photographs_are_refused_before_a_training(tmp_path, capsys):
+    folder = make_capture(tmp_path / "tiny", views=4, size=(24, 16), points=40).folder
+    check_folds([CaptureSpec("tiny", "own", folder)], 4)
+    words = [
+        "reproduce",
+        "compare",
+        "--recipes",
+        "3dgs",
+        "scaffold-gs",
+        "--captures",
+        str(folder),
+        "--out",
+        str(tmp_path / "out"),
+        "--dry-run",
+    ]
+    assert cli.main([*words, "--folds", "5"]) == 2 and "at least 5 photographs for --folds 5, found 4" in capsys.readouterr().err
+    assert cli.main([*words, "--folds", "4"]) == 0
