@@ -148,3 +148,77 @@ def test_the_bar_and_the_help_fit_a_phone(page):
     assert left >= 0 and right <= 300 and top >= 0 and bottom <= min(b[1] for b in buttons)
     assert all(b[0] >= 0 and b[2] <= 300 and b[3] <= 500 for b in buttons)
     assert max(b[3] - b[1] for b in buttons) < 1.5 * min(b[3] - b[1] for b in buttons)  # no text in two lines
+
+
+def test_keys_go_by_their_letters_and_do_not_repeat(page):
+    made, _ = page
+    tab = made.tab
+    tab.evaluate("window.flown = 0; window.sceneExperts.page.flyAround = () => { window.flown += 1; };")
+    send = "([key, code, more]) => dispatchEvent(new KeyboardEvent('keydown', { key, code, ...more }))"
+    tab.evaluate(send, ["p", "KeyR", {}])  # a Dvorak keyboard
+    tab.evaluate(send, ["l", "KeyP", {}])
+    tab.evaluate(send, ["p", "KeyR", {"repeat": True}])
+    assert tab.evaluate("window.flown") == 1
+    before = tab.evaluate("window.sceneExperts.page.index")
+    tab.evaluate(send, ["]", "Digit9", {"ctrlKey": True, "altKey": True}])  # AltGr of a German keyboard
+    assert tab.evaluate("window.sceneExperts.page.index") == (before + 1) % 3
+    tab.evaluate(send, ["]", "BracketRight", {"metaKey": True}])  # forward, of the browser
+    assert tab.evaluate("window.sceneExperts.page.index") == (before + 1) % 3 and made.errors == []
+
+
+def test_lost_graphics_come_back(tmp_path):
+    path = write(tmp_path / "a.html", "live")
+    with browsers(GL, WIDTH, HEIGHT) as make:
+        made = make().open(path)
+        tab = made.tab
+        tab.wait_for_function(READY)
+        tab.evaluate("window.lost = document.querySelector('canvas').getContext('webgl2').getExtension('WEBGL_lose_context')")
+        tab.evaluate("window.lost.loseContext()")
+        tab.mouse.move(200, 100)
+        tab.mouse.down()
+        tab.mouse.move(240, 110, steps=4)
+        tab.mouse.up()
+        tab.wait_for_timeout(500)
+        assert "took the graphics away" in tab.evaluate(SAID)
+        tab.evaluate("window.lost.restoreContext()")
+        tab.wait_for_function(READY)
+        assert made.errors == []
+
+
+def test_staying_near_photographs_does_not_tip_the_picture_over(tmp_path):
+    with browsers(GL, WIDTH, HEIGHT) as make:
+        made = make().open(write(tmp_path / "a.html", "live"))
+        tab = made.tab
+        tab.wait_for_function(READY)
+        found = tab.evaluate("""() => {
+          const { camera, settings } = window.sceneExperts.page;
+          const tilt = () => Math.abs(camera.rotation.reduce((sum, row, i) => sum + row[0] * camera.up[i], 0));
+          camera.set(settings.poses[0]);
+          for (let i = 0; i < 30; i++) camera.orbit([0, 0.02]);
+          const before = tilt(), place = [...camera.position];
+          for (let i = 0; i < 60; i++) { camera.orbit([0.05, 0]); camera.moveTo(place); }
+          return [before, tilt()];
+        }""")
+        assert abs(found[1] - found[0]) < 0.02
+        side = tab.evaluate("""() => {
+          const { camera } = window.sceneExperts.page, moves = [], { up } = camera;
+          const seen = (point) => {
+            const away = point.map((v, i) => v - camera.position[i]);
+            const at = [0, 1, 2].map((j) => away.reduce((sum, v, i) => sum + v * camera.rotation[i][j], 0));
+            return [at[0] / at[2], at[1] / at[2]];
+          };
+          const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+          const unit = (a) => a.map((v) => v / Math.hypot(...a)), back = (a) => a.map((v) => -v);
+          const ahead = unit(cross(up, Math.abs(up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0])), level = unit(cross(ahead, up));
+          const turned = [[level, back(up)], [up, level], [back(up), back(level)], [back(level), up]];
+          for (const [x, y] of turned) for (const spin of [[-0.1, 0], [0, -0.1]]) {
+            camera.set({ position: [0, 0, 0], rotation: [0, 1, 2].map((i) => [x[i], y[i], ahead[i]]) });
+            const near = ahead.map((v) => 0.7 * camera.distance * v), from = seen(near);
+            camera.orbit(spin);
+            const to = seen(near);
+            moves.push([to[0] - from[0], to[1] - from[1], ...spin]);
+          }
+          return moves;
+        }""")
+        for right, down, asked, below in side:  # the hand moves against what is asked of the camera; what is near goes with it
+            assert (right > 0.02 and abs(down) < 0.005) if asked else (down > 0.02 and abs(right) < 0.005), (right, down, asked, below)

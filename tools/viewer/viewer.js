@@ -83,11 +83,12 @@ class Page {
   }
 
   press(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
-    const act = { KeyR: () => this.home(), KeyF: fullScreen, BracketLeft: () => this.step(-1), BracketRight: () => this.step(1),
-      KeyL: () => this.writeHash(), KeyH: () => show("help"), Escape: () => show("help", false), KeyP: () => this.flyAround() }[event.code];
-    if (act) act();
-    else if (this.keys.press(event)) this.flight = null;
+    const key = event.key.toLowerCase(), typed = key === "[" || key === "]"; // on many keyboards with AltGr, which is Ctrl and Alt
+    if (event.metaKey || ((event.ctrlKey || event.altKey) && !(typed && event.altKey))) return;
+    const acts = { r: () => this.home(), f: fullScreen, "[": () => this.step(-1), "]": () => this.step(1), l: () => this.writeHash(), h: () => show("help"),
+      escape: () => show("help", false), p: () => this.flyAround() };
+    if (this.keys.press(event)) this.flight = null;
+    else if (!(event.repeat && "fhp".includes(key))) acts[key]?.();
     this.wake();
   }
 

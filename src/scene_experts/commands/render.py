@@ -75,7 +75,7 @@ def render(args: list[str]) -> int:
             print(f"warning: {text} and may show fog; {nearer} stays near the photographs", file=sys.stderr)
         if command.save_path:
             film.write_path(command.save_path)
-        shown = "" if command.options.show == ("picture",) else "_" + "_".join(command.options.show)
+        shown = name_shown(command)
         out = command.out or command.run / "renders" / f"{Path(command.options.path).stem}{shown}.mp4"
         with ProgressBar(Console(stderr=True, markup=False)) as tell:
             count = film.write(out, rasterize, device, tell)
@@ -84,6 +84,18 @@ def render(args: list[str]) -> int:
             each.images.close()
     print(f"wrote {out} ({count} frames, {count / film.path.fps:.1f} s)")
     return 0
+
+
+def name_shown(command: RenderCommand) -> str:
+    """Return the part of a video's name that says what it shows; empty for the pictures of the
+    run."""
+    options = command.options
+    parts = [] if options.show == ("picture",) else list(options.show)
+    parts += [options.attribute] if options.attribute != FilmOptions().attribute else []
+    parts += [f"only{'-'.join(map(str, options.only))}"] if options.only else []
+    parts += [f"beside-{path.resolve().name}" for path in command.beside]
+    parts += [] if command.step is None else [str(command.step)]
+    return "".join(f"_{part}" for part in parts)
 
 
 def is_alike(run: OpenRun, first: OpenRun) -> bool:

@@ -118,12 +118,13 @@ def ticks(low: float, high: float, count: int = 5) -> list[float]:
 
 def log_ticks(low: float, high: float) -> list[float]:
     """Return logarithms of round numbers between two logarithms: 1, 2, 5 of each decade, or some
-    decades if there are many."""
+    decades if there are many; of evenly spaced ones where fewer than two of these lie there."""
     decades = range(math.floor(low), math.ceil(high) + 1)
     every = max(1, math.ceil(len(decades) / 6))
     factors = (1, 2, 5) if len(decades) <= 4 else (1,)
     found = [e + math.log10(m) for e in decades[::every] for m in factors]
-    return [value for value in found if low <= value <= high]
+    inside = [value for value in found if low <= value <= high]
+    return inside if len(inside) > 1 else [math.log10(value) for value in ticks(10**low, 10**high) if value > 0]
 
 
 def label(value: float) -> str:

@@ -49,6 +49,10 @@ def write(runs: Sequence[Path], out: Path | None = None) -> Path:
         raise InputError("expected at least one run folder, found none; name the folders that `scene-experts train --out` wrote")
     if out is None and len(runs) > 1:
         raise InputError("expected --out FILE.html for several runs, found none; give one")
+    if out is not None and out.is_dir():
+        out = out / NAME
+    if out is not None and out.suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"expected --out as a folder or a file ending in .html, found {out}; choose one of those")
     with guarding(runs[0] if len(runs) == 1 else "one of the runs", RUN):  # the files of a run may hold anything
         sources = tell_apart([read_run(run) for run in runs])
         page = build_page(sources).encode()
@@ -96,12 +100,13 @@ def build_page(sources: Sequence[ShownRun]) -> str:
 
 def explain_views(sources: Sequence[ShownRun]) -> tuple[str, str]:
     """Return the heading of the shown views, and what they are."""
-    held = all(s.views == "test" for s in sources)
-    which = (
-        "Photographs that the training did not use"
-        if held
-        else "Photographs that were trained on, because none was held out: other views look worse"
-    )
+    trained = [s.name for s in sources if s.views != "test"]
+    held = not trained
+    which = "Photographs that the training did not use"
+    if trained and len(trained) < len(sources):
+        which += f", but those of {', '.join(map(escape, trained))}, which held none out and saw these: other views look worse"
+    elif trained:
+        which = "Photographs that were trained on, because none was held out: other views look worse"
     how = "the best view and the worst view first. Move the pointer over a picture, or drag the slider."
     return f"<h2>{'Held-out' if held else 'Training'} views</h2>", f"<p class='soft'>{which}; {how}</p>"
 
@@ -236,7 +241,7 @@ def format_scores(sources: Sequence[ShownRun]) -> str:
     """Return the table of scores by view as HTML."""
     rows = []
     failed = {name for s in sources for name in find_failed(s.per_view)}
-    for name in sources[0].per_view:
+    for name in dict.fromkeys(name for s in sources for name in s.per_view):
         cells = []
         for s in sources:
             facts = s.per_view.get(name, {})

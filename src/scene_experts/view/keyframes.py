@@ -21,7 +21,7 @@ from scene_experts.data.capture import Capture
 from scene_experts.geometry.poses import interpolate_poses, make_pose, with_fov
 from scene_experts.geometry.rotation import matrix_to_quat, quat_to_matrix
 from scene_experts.view import path_files
-from scene_experts.view.paths import CameraPath, make_path
+from scene_experts.view.paths import CameraPath, make_round
 
 SIZE = (1280, 720)  # width and height of the saved path, px
 MOST_KEYS = 200
@@ -121,7 +121,7 @@ class Keyframes:
         """Move a client along a closed path that fits the capture, or stop it. The keyframes stay
         as they are."""
         if client is not None:
-            self.toggle(client, Flight(make_path("auto", self.capture, AROUND).cameras, True, ROUND / AROUND))
+            self.toggle(client, Flight(make_round(self.capture, AROUND).cameras, True, ROUND / AROUND))
 
     def toggle(self, client: Any, flight: Flight) -> None:
         """Start a flight of a client, or stop the one that is on its way."""

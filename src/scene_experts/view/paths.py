@@ -139,6 +139,16 @@ def make_path(name: str, capture: Capture, frames: int, size: tuple[int, int] | 
     return CameraPath(tuple(replace(model, world_to_cam=pose.float()) for pose in poses), fps)
 
 
+def make_round(capture: Capture, frames: int) -> CameraPath:
+    """Make a path that ends where it begins, as `choose_path` chooses it; along the captured poses it
+    goes there and back. frames: Number of cameras, even and at least 2."""
+    name = choose_path(analyse_cameras(capture))
+    if name != "views":
+        return make_path(name, capture, frames)
+    there = make_path(name, capture, frames // 2 + 1)
+    return replace(there, cameras=there.cameras + there.cameras[-2:0:-1])
+
+
 def orbit(rig: CameraRig, frames: int) -> list[Tensor]:
     """Go once around the centre at the median height and distance of the cameras, looking at it.
     Returns world-to-camera matrices."""

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 NEAR = 0.2  # radius around each photograph's place, as a share of the distance to the scene: 11 degrees beside a photograph
+SAME = 1e-3  # as a share of that distance: places nearer to each other are one, such as those of the views of a panorama
 SPACING = 0.9  # quantile of the distances between neighbouring places that the radius covers at least
 
 
@@ -35,6 +36,8 @@ def find_region(places: Tensor, distance: float) -> Region:
     places = places.double()
     radius = NEAR * distance
     if len(places) > 1:
-        apart = torch.cdist(places, places).fill_diagonal_(torch.inf).amin(1)
-        radius = max(radius, float(torch.quantile(apart, SPACING)))
+        apart = torch.cdist(places, places)
+        apart = apart.masked_fill(apart <= SAME * distance, torch.inf).amin(1)
+        if len(found := apart[apart.isfinite()]):
+            radius = max(radius, float(torch.quantile(found, SPACING)))
     return Region(places, radius)

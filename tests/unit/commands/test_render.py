@@ -10,6 +10,8 @@ from PIL import Image
 
 import scene_experts as se
 from scene_experts import cli
+from scene_experts.arguments.parse import Command, parse
+from scene_experts.commands.render import RenderCommand, name_shown
 from scene_experts.core.errors import InputError
 from scene_experts.data.views import World
 from scene_experts.evaluate import pictures
@@ -139,3 +141,9 @@ def test_runs_of_two_worlds_beside_each_other(run, tmp_path):
         assert cli.main(["render", str(first), *more, "--path", "test", "--out", str(tmp_path / first.name)]) == 0
     alone, both = (pictures.read_picture(tmp_path / one.name / "00000.png").astype(int) for one in (other, run))
     assert abs(both[:, -alone.shape[1] :] - alone).mean() < 0.5
+
+
+def test_videos_of_other_things_have_other_names():
+    words = [["--only", "2", "1"], ["--beside", "runs/b"], ["--step", "300"], ["--attribute", "cov"], ["--show", "depth", "alpha"]]
+    made = [name_shown(parse(RenderCommand, Command("render", ("run",)), ["run", *more])) for more in [[], *words]]
+    assert made == ["", "_only2-1", "_beside-b", "_300", "_cov", "_depth_alpha"]

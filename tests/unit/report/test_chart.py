@@ -1,6 +1,7 @@
 """Charts: points lie where the axes say. Without data, nothing is drawn."""
 
 import itertools
+import math
 import re
 
 import pytest
@@ -80,3 +81,9 @@ def test_no_label_is_cut_at_the_edge(last):
 
 def test_text_has_contrast_on_every_colour():
     assert text_on("#0072b2") == "#fff" and text_on("#e69f00") == "#000"
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.12, 0.19), (0.028, 0.048), (2.1, 4.9), (1.0, 1.001)])
+def test_a_log_axis_has_numbers_in_a_short_range_too(low, high):
+    found = log_ticks(math.log10(low), math.log10(high))
+    assert len(found) >= 2 and all(math.log10(low) - 1e-9 <= value <= math.log10(high) + 1e-9 for value in found)

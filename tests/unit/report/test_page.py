@@ -63,6 +63,12 @@ def test_several_runs_stand_beside_each_other(tmp_path):
     assert "a (moe-gs)" in same and "c (moe-gs)" in same
     with pytest.raises(InputError, match="--out"):
         write(runs)
+    with pytest.raises(InputError, match=naming("config.json")):
+        write(runs, runs[0] / "config.json")
+    assert write(runs, tmp_path) == tmp_path / "report.html"
+    per_view = json.loads((runs[1] / "per_view.json").read_text())
+    write_json(runs[1] / "per_view.json", {**per_view, "one more.png": next(iter(per_view.values()))})
+    assert "<td>one more.png</td>" in write(runs, tmp_path).read_text()
 
 
 @pytest.mark.slow

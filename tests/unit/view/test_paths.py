@@ -9,7 +9,7 @@ import torch
 from scene_experts.core.errors import InputError
 from scene_experts.geometry.poses import look_at
 from scene_experts.view import paths
-from scene_experts.view.paths import CameraRig, choose_best_view, make_path, orbit, spiral
+from scene_experts.view.paths import CameraRig, choose_best_view, make_path, make_round, orbit, spiral
 from support.captures import load
 from support.places import DEMO
 from support.scenes import CAMERA
@@ -131,3 +131,12 @@ def test_a_path_is_chosen_by_the_shape_of_the_capture():
     assert float(half.forward.mean(0).norm()) < paths.FACING and paths.choose_path(half) in ("spiral", "views")
     front = replace(around, positions=around.positions[:3], rotations=around.rotations[:3], cameras=around.cameras[:3])
     assert paths.choose_path(front) == "spiral"
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_round_ends_where_it_begins(turned, capture, monkeypatch):
+    if turned:
+        monkeypatch.setattr("scene_experts.view.paths.choose_path", lambda rig: "views")
+    places = torch.stack([camera.position for camera in make_round(capture, 24).cameras])
+    steps = (places - places.roll(1, 0)).norm(dim=1)
+    assert len(places) == 24 and float(steps[0]) <= 1.5 * float(steps[1:].max())

@@ -1,5 +1,6 @@
 """The region that photographs were taken in."""
 
+import pytest
 import torch
 
 from scene_experts.view.region import NEAR, find_region
@@ -25,3 +26,9 @@ def test_neighbouring_places_are_connected():
     between = (places[0] + places[1]) / 2
     assert torch.equal(region.nearest(between), between)
     assert find_region(places[:1], 1.0).radius == NEAR
+
+
+def test_places_of_several_views_are_one_place():
+    places = torch.tensor([[float(i), 0, 0] for i in range(5)])
+    assert find_region(places.repeat_interleave(12, 0), 3.0).radius == find_region(places, 3.0).radius == 1.0
+    assert find_region(places[:1].repeat(12, 1), 3.0).radius == pytest.approx(0.6)

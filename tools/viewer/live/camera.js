@@ -89,9 +89,11 @@ export class Camera {
   }
   orbit([right, down]) {
     const { target, up } = this, turned = (axis, angle) => [0, 1, 2].map((j) => turn(column(this.rotation, j), axis, angle));
-    const upright = Math.sign(-dot(column(this.rotation, 1), up)) || 1; // a camera that hangs turns as the hand goes
-    this.rotation = fromColumns(...turned(up, upright * right));
-    const steep = Math.abs(dot(column(this.rotation, 2), up)), columns = turned(column(this.rotation, 0), down), next = Math.abs(dot(columns[2], up));
+    const [across, below] = [0, 1].map((j) => dot(column(this.rotation, j), up)), sign = (v) => Math.sign(v) || 1;
+    // A camera that hangs, or lies on its side, turns as the hand goes.
+    const [round, over, axis] = Math.abs(across) > Math.abs(below) ? [sign(across) * down, -right, 1] : [sign(-below) * right, down, 0];
+    this.rotation = fromColumns(...turned(up, round));
+    const steep = Math.abs(dot(column(this.rotation, 2), up)), columns = turned(column(this.rotation, axis), over), next = Math.abs(dot(columns[2], up));
     if (next < STEEP || next < steep) this.rotation = fromColumns(...columns);
     this.position = add(target, column(this.rotation, 2), -this.distance);
   }
@@ -99,11 +101,13 @@ export class Camera {
   fly(move) {
     this.position = add(this.position, times(this.rotation, move));
   }
-  // Moves to a place and keeps looking at the target.
+  // Moves to a place and keeps looking at the target, as tilted as before.
   moveTo(position) {
-    const { target } = this;
+    const { target } = this, [before, ahead] = [0, 2].map((j) => column(this.rotation, j));
     this.position = position;
-    const z = unit(add(target, position, -1)), right = add(column(this.rotation, 0), z, -dot(column(this.rotation, 0), z)), x = unit(right);
+    const z = unit(add(target, position, -1)), level = (axis) => unit(cross(axis, this.up)), steep = [ahead, z].some((axis) => length(cross(axis, this.up)) < 1e-3);
+    const tilt = Math.atan2(dot(cross(level(ahead), before), ahead), dot(level(ahead), before));
+    const x = steep ? unit(add(before, z, -dot(before, z))) : turn(level(z), z, tilt);
     this.rotation = fromColumns(x, cross(z, x), z);
     this.distance = length(add(target, position, -1));
   }

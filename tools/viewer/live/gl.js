@@ -89,6 +89,7 @@ export class GlRenderer {
   }
   // words: from CpuDecoder.pack. Raises an Error with a sentence where the texture would be too high.
   setWords(words) {
+    if (this.gl.isContextLost()) return; // the page is told, and opens another one
     const { gl } = this, texels = words.length / 4, height = Math.max(1, Math.ceil(texels / WIDTH)), most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     if (WIDTH > most || height > most) throw new Error(`The scene has more Gaussians than this browser's WebGL 2 holds (${Math.floor((most * WIDTH) / 3)})`);
     const whole = new Uint32Array(4 * WIDTH * height);

@@ -49,7 +49,8 @@ export class Page {
       const canvas = document.createElement("canvas");
       canvas.setAttribute("role", "img");
       canvas.setAttribute("aria-label", `the scene, ${this.settings.count.toLocaleString("en")} Gaussians`);
-      canvas.addEventListener("webglcontextlost", () => say("The browser took the graphics away; load the page again"));
+      canvas.addEventListener("webglcontextlost", (event) => (event.preventDefault(), say("The browser took the graphics away; load the page again")));
+      canvas.addEventListener("webglcontextrestored", () => this.lose());
       document.querySelector("main").prepend(canvas);
       this.canvas = canvas;
       this.resize();
@@ -125,11 +126,12 @@ export class Page {
   }
 
   press(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
-    const act = { KeyR: () => this.home(), KeyF: fullScreen, BracketLeft: () => this.step(-1), BracketRight: () => this.step(1),
-      KeyL: () => this.writeHash(), KeyH: () => show("help"), Escape: () => show("help", false), KeyP: () => this.flyAround() }[event.code];
-    if (act) act();
-    else if (!/^(INPUT|SECTION)$/.test(event.target.tagName) && this.keys.press(event)) this.take();
+    const key = event.key.toLowerCase(), typed = key === "[" || key === "]"; // on many keyboards with AltGr, which is Ctrl and Alt
+    if (event.metaKey || ((event.ctrlKey || event.altKey) && !(typed && event.altKey))) return;
+    const acts = { r: () => this.home(), f: fullScreen, "[": () => this.step(-1), "]": () => this.step(1), l: () => this.writeHash(), h: () => show("help"),
+      escape: () => show("help", false), p: () => this.flyAround() };
+    if (!/^(INPUT|SECTION)$/.test(event.target.tagName) && this.keys.press(event)) this.take();
+    else if (!(event.repeat && "fhp".includes(key))) acts[key]?.();
     this.wake();
   }
 

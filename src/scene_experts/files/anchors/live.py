@@ -28,7 +28,7 @@ from scene_experts.files.anchors import compact
 from scene_experts.files.anchors.data import AnchorData
 from scene_experts.files.anchors.quality import choose_precision
 from scene_experts.files.anchors.rounding import distance_exponent
-from scene_experts.files.anchors.thumbnails import BYTES, make_thumbnails
+from scene_experts.files.anchors.thumbnails import make_thumbnails
 from scene_experts.files.cameras import camera_entries
 from scene_experts.files.formats import html
 from scene_experts.files.measure import Painter, Tell
@@ -212,7 +212,8 @@ def fit(
     expect_drawable(contents)
 
     note = {} if capture is None or options.target_mb == 0 else view_note(capture, world)
-    spare = SPARE + (BYTES * 4 // 3 if options.photographs else 0)
+    pictures = make_thumbnails(capture) if options.photographs and options.target_mb and capture is not None else []
+    spare = SPARE + sum(4 * ((len(picture) + 2) // 3) + 3 for picture in pictures)
 
     def size(data: AnchorData) -> int:
         return spare + len(make_page(data, note, compact.encode(data)[0]))

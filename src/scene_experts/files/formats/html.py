@@ -42,7 +42,7 @@ from scene_experts.files.formats.splats import Splats
 from scene_experts.files.formats.spz import FARTHEST, decode, out_of_range, size_warning, spz_bytes
 from scene_experts.files.registry import Format
 from scene_experts.geometry.rotation import estimate_up
-from scene_experts.view.paths import choose_best_view, make_path
+from scene_experts.view.paths import choose_best_view, make_round
 from scene_experts.view.region import find_region
 
 ASSETS = files("scene_experts.files.formats") / "assets"
@@ -173,12 +173,14 @@ def view_note(capture: Capture, world: World) -> dict[str, Any]:
     world: the frame that the Gaussians are written in.
     """
     entries = camera_entries(capture.views, world)
+    flight = make_round(capture, FLIGHT).cameras
+    moves = any(not torch.equal(camera.world_to_cam, flight[0].world_to_cam) for camera in flight)  # not from one photograph
     return {
         "camera": entries[choose_best_view(capture)] if entries else None,
         "cameras": entries,
         "background": list(capture.background),
         "title": f"{capture.name}, a scene by scene-experts",
-        "flight": camera_entries([View("flight", camera, Path()) for camera in make_path("auto", capture, FLIGHT).cameras], world),
+        "flight": camera_entries([View("flight", camera, Path()) for camera in flight], world) if moves else [],
     }
 
 

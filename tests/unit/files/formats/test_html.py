@@ -243,7 +243,9 @@ def test_a_capture_s_views_in_the_frame_of_the_file():
     assert note["camera"] == note["cameras"][1] and len(note["cameras"]) == 2 and note["background"] == [1.0, 1.0, 1.0]
     np.testing.assert_allclose(note["camera"]["position"], [-1.0, 0.0, -3.5 + 3.0], atol=1e-6)
     found = page_settings(blobs(), note)
-    assert len(found["flight"]) == 48 and page_settings(blobs(), {})["flight"] == []
+    assert found["flight"] == page_settings(blobs(), {})["flight"] == []  # one photograph
+    both = SimpleNamespace(**{**vars(capture), "train": (0, 1)})
+    assert len(page_settings(blobs(), view_note(both, world))["flight"]) == 48  # type: ignore[arg-type]
     assert found["reach"] > 0 and page_settings(blobs(), {})["reach"] is None
     assert found["origin"] == [0.0, 0.0, 0.0] and page_settings(blobs(), note | {"origin": [1e6, 2.0, 3.0]})["origin"] == [1e6, 2.0, 3.0]
     assert found["antialias"] and found["fov"] == pytest.approx(math.degrees(2 * math.atan(0.4)))
