@@ -2,7 +2,8 @@
 the room behind what was photographed.
 
 Structure from motion finds no points there. Without any, a training explains what it sees there by
-blobs before the cameras that see it, which hide the scene from others (results/default.md).
+blobs before the cameras that see it, which hide the scene from others. Far away a scene needs no
+detail, so nothing is added there later (results/default.md).
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ CELLS = 25  # along the longer side of a picture; each gets at most one point
 REACH = 2  # cells around one in which a point of the capture says that it is no hole
 FEWEST = 20  # points of a view that tell its farthest depth
 FARTHEST = 0.99  # quantile of their depths that counts as the farthest: some are wrong
+OUTSIDE = 0.005  # quantile of the coordinates of points, at both ends, that are outside of the box around them: some are wrong
 PART = 0.1  # largest number of far points, in those of the capture
 
 
@@ -32,6 +34,7 @@ class FarPoints:
     points: Points  # trained world; the capture's own come first
     added: int  # points far away
     share: float  # of the pictures that shows no point, 0 to 1
+    box: tuple[float, ...]  # low and high corner (x, y, z, x, y, z) of what has points of the capture, with room around
 
     def describe(self) -> str:
         """Return one line for the user."""
@@ -66,7 +69,15 @@ def add_far_points(capture: Capture, times: float) -> FarPoints | None:
         cloud, _ = thin(cloud, most)
     own = capture.points
     far = torch.from_numpy(cloud.xyz).to(own.xyz), torch.from_numpy(cloud.rgb.clip(0, 255).round().astype(np.uint8)).to(own.rgb)
-    return FarPoints(Points(torch.cat([own.xyz, far[0]]), torch.cat([own.rgb, far[1]])), len(cloud), holes / cells)
+    return FarPoints(Points(torch.cat([own.xyz, far[0]]), torch.cat([own.rgb, far[1]])), len(cloud), holes / cells, find_box(xyz))
+
+
+def find_box(xyz: NDArray[np.float64]) -> tuple[float, ...]:
+    """Return the low and the high corner of a box around the points [n, 3], but for those outside of
+    quantiles of their coordinates. It leaves room on each side as wide as its widest."""
+    low, high = np.quantile(xyz, OUTSIDE, axis=0), np.quantile(xyz, 1 - OUTSIDE, axis=0)
+    room = float((high - low).max())
+    return tuple(float(f"{side:.4g}") for side in (*(low - room), *(high + room)))  # the same on all processors
 
 
 def find_holes(view: View, xyz: NDArray[np.float64]) -> tuple[NDArray[np.bool_], float | None]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic
+from typing import Any, ClassVar, Generic, Self
 
 import torch
 from typing_extensions import TypeVar
@@ -58,6 +58,11 @@ class Strategy(Part, Generic[S], ABC):
         """Low and high corner (x, y, z, x, y, z) of the box in which rows are created, in trained
         world units; empty means everywhere."""
         return ()
+
+    def within(self, box: tuple[float, ...]) -> Self:
+        """Return the rule that creates rows in a box only (see `box`); the rule itself if it knows no
+        such limit or has one."""
+        return self
 
     def needs_whole_table(self) -> str:
         """Return the setting that needs all rows in every process, for the message of --shard; ""

@@ -3,8 +3,8 @@ removal of anchors."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar, Literal, Self
 
 import torch
 from torch import Tensor
@@ -74,6 +74,9 @@ class AnchorControl(Strategy[L]):
     @property
     def box(self) -> tuple[float, ...]:
         return self.bounds
+
+    def within(self, box: tuple[float, ...]) -> Self:
+        return self if self.bounds else replace(self, bounds=box)
 
     def count_steps(self, iterations: int) -> int:
         """Number of densification steps in a training of `iterations` iterations."""

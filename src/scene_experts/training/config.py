@@ -74,8 +74,8 @@ class Train:
     plane sweep finds in them, unless --init or --points says where to start."""
     far_points: Annotated[float, Range(0, 1000)] = 0.0
     """Where the photographs show none of the capture's points, such as sky, start from points at this
-    many times the farthest depth that they show, unless --init says where to start. 0: from
-    none."""
+    many times the farthest depth that they show, unless --init says where to start; nothing is
+    added there later. 0: from none."""
     mean_background: bool = False
     """Put the mean colour of the training photographs behind what none of them shows, unless
     --background names a colour or the photographs are transparent or masked."""

@@ -183,7 +183,7 @@ def iterate(training: Training, run: Job, capture: Capture, rasterize: Rasterize
     edits, survey = [], survey_of(training, run, capture, rasterize)
     for number in numbers:
         cfg.growth.survey(scene, survey, number, training.growth_rng)
-        edit = cfg.growth.update(scene, number, training.growth_rng, cap)
+        edit = training.growth.update(scene, number, training.growth_rng, cap)
         edits += [] if edit is None else [(number, edit)]
     if limited:
         training.largest.search(before, peak_bytes(scene.table.device))

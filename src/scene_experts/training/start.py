@@ -100,11 +100,12 @@ def _start(cfg: Train, data: Data, capture: Capture, device: str, dtype: torch.d
 
 def _start_far(cfg: Train, data: Data, capture: Capture, device: str, dtype: torch.dtype) -> Training:
     """Start a training from the capture's points, and from points far away where the recipe asks
-    for them."""
+    for them. Then rows are created around the former only."""
     wanted = cfg.far_points > 0 and data.init == "auto" and not capture.random_points
     found = add_far_points(capture, cfg.far_points) if wanted else None
     if found is None:
         return Training.start(cfg, capture, device, dtype)
     training = Training.start(cfg, replace(capture, points=found.points), device, dtype)
+    training.box = found.box
     training.computed = f"{found.describe()}; --init points starts from the capture's own alone"
     return training

@@ -22,6 +22,7 @@ from scene_experts.scene import Scene, exposure, poses, restore_scene
 from scene_experts.scene.exposure import Exposures
 from scene_experts.scene.fit import restore_foreign
 from scene_experts.scene.poses import Poses
+from scene_experts.strategy import Strategy
 from scene_experts.training.average import Averages
 from scene_experts.training.clock import Clock
 from scene_experts.training.config import Train
@@ -57,6 +58,7 @@ class Training:
         self.computed = ""  # of the points that the scene has just started from; for `Started.start`
         self.capture_id = self.poses = ""  # fingerprint and poses of the capture
         self.chosen: str | None = None  # `Capture.chosen`; None: not known
+        self.box: tuple[float, ...] = ()  # in which rows are created, beside what `cfg.growth` says; empty: everywhere
         self.views_rng = torch.Generator().manual_seed(cfg.seed)  # for the order of views and for backgrounds
         self.growth_rng = torch.Generator().manual_seed(cfg.seed + 1)  # for densification
         columns = scene.table.params
@@ -151,6 +153,11 @@ class Training:
             self.optimizer.step(rows=rows)  # type: ignore[call-arg]
         self.optimizer.zero_grad(set_to_none=True)
 
+    @property
+    def growth(self) -> Strategy[Any]:
+        """The rule by which rows are created and removed."""
+        return self.cfg.growth.within(self.box) if self.box else self.cfg.growth
+
     def companions(self, parameter: Tensor) -> list[Tensor]:
         """Return the tensors that follow a parameter of a network, each of its shape: the
         optimiser's moments and the average."""
@@ -217,6 +224,7 @@ class Training:
             "capture": self.capture_id,
             "poses": self.poses,
             "chosen": self.chosen,
+            **({"box": list(self.box)} if self.box else {}),
         }
 
     @classmethod
@@ -250,7 +258,7 @@ class Training:
         training.queue = tensors["queue"].tolist()
         training.step, training.clock = int(meta["step"]), Clock.of(meta)
         training.capture_id, training.poses = meta.get("capture", ""), meta.get("poses", "")
-        training.chosen = meta.get("chosen")
+        training.chosen, training.box = meta.get("chosen"), tuple(meta.get("box", ()))
         return training
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from scene_experts.core.types import Points
-from scene_experts.data.far import CELLS, FARTHEST, PART, REACH, add_far_points, find_holes
+from scene_experts.data.far import CELLS, FARTHEST, OUTSIDE, PART, REACH, add_far_points, find_holes
 from scene_experts.data.views import Frame
 from support.captures import load
 from support.synthetic import make_capture
@@ -65,6 +65,9 @@ def test_points_lie_in_the_holes_at_their_depth_with_their_colours(capture):
     column, row = ((camera.fx * x / z + camera.cx) / (SIZE[0] / CELLS)).long(), ((camera.fy * y / z + camera.cy) / (SIZE[0] / CELLS)).long()
     assert hole[row, column].mean() > 0.9  # those of several cells lie between them
     assert "points far away, for the" in found.describe()
+    low, high = np.quantile(some.points.xyz.double().numpy(), (OUTSIDE, 1 - OUTSIDE), axis=0)
+    room = (high - low).max()
+    np.testing.assert_allclose(found.box, [*(low - room), *(high + room)], rtol=1e-3)
 
 
 def test_every_hole_has_its_point_where_there_is_room(capture, monkeypatch):

@@ -103,5 +103,22 @@ def test_far_points_are_added_where_the_recipe_asks_and_init_does_not_say_otherw
         started[name] = start(recipe.scaled(), Data(folder, init=init), capture, "cpu", torch.float32)
     found = add_far_points(load(folder), 5.0)
     assert found is not None and started["with"].computed == f"{found.describe()}; --init points starts from the capture's own alone"
-    assert started["points"].computed == started["none"].computed == ""
+    assert started["points"].computed == started["none"].computed == "" and started["points"].box == ()
+    assert started["with"].box == found.box and started["with"].growth.box == found.box and started["points"].growth.box == ()
     assert started["with"].scene.table.total > started["points"].scene.table.total == started["none"].scene.table.total
+
+
+def test_nothing_grows_far_away_and_a_resumed_training_knows_it(tmp_path):
+    folder = make_capture(tmp_path / "box", views=9, size=(48, 32), points=40, mixed_sizes=False).folder
+    cfg = config("scaffold-gs", far_points=5.0)
+    list(events(cfg, folder, tmp_path / "whole", stop_at=40, init="auto"))
+    list(events(cfg, folder, tmp_path / "parts", stop_at=15, init="auto"))
+    list(events(cfg, folder, tmp_path / "parts", stop_at=40, resume=True, init="auto"))
+    assert_same(last_tensors(tmp_path / "whole"), last_tensors(tmp_path / "parts"))
+    box = add_far_points(load(folder), 5.0).box
+    assert resume(cfg.scaled(), tmp_path / "parts" / "checkpoints", "cpu").growth.box == box
+    low, high = torch.tensor(box).view(2, 3)
+    began = start(cfg.scaled(), Data(folder), load(folder), "cpu", torch.float32).scene.positions
+    ended = resume(cfg.scaled(), tmp_path / "whole" / "checkpoints", "cpu").scene.positions
+    outside = [int((~((xyz >= low) & (xyz <= high)).all(1)).sum()) for xyz in (began, ended)]
+    assert 0 < outside[1] <= outside[0] and len(ended) > len(began)
