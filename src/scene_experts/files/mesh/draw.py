@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from scene_experts.core.errors import InputError
+from scene_experts.data.far import find_box
 from scene_experts.data.views import Capture
 from scene_experts.files.measure import Painter, Tell
 from scene_experts.files.mesh.fuse import DepthView, Points, clean, find_blocks, fuse, see_points
@@ -80,9 +81,14 @@ def draw_views(task: MeshTask) -> list[DepthView]:
 
 
 def _inside(task: MeshTask, points: Points) -> NDArray[np.bool_]:
-    """Which points [N, 3] of the trained world --crop keeps, [N]."""
+    """Which points [N, 3] of the trained world --crop keeps, [N]. Without it, those that a training
+    with points far away draws there are left out: they are a background, not a surface."""
     if not task.crop:
-        return np.ones(len(points), np.bool_)
+        capture = task.capture
+        if not task.run.config.train.far_points or capture.points is None or capture.random_points:
+            return np.ones(len(points), np.bool_)
+        low, high = np.reshape(find_box(capture.points.xyz.double().numpy()), (2, 3))
+        return np.asarray(((points >= low) & (points <= high)).all(1), dtype=np.bool_)
     return parse_crop(task.crop).contains(torch.from_numpy(_to_input(task.capture, points)), task.capture).numpy()
 
 
