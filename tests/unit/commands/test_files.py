@@ -121,3 +121,19 @@ def test_the_hint_for_a_heavy_page_is_an_option_of_its_format(run, tmp_path, cap
     monkeypatch.setattr("scene_experts.files.export.export_several", lambda *_, **__: [page])
     assert export([str(run), "--format", "html"]) == 0
     assert said in capsys.readouterr().out
+
+
+def test_a_relative_path_of_the_capture_is_no_choice_of_the_training(run, tmp_path, capsys, monkeypatch):
+    assert export([str(run), "--format", "ply", "--out", str(tmp_path / "a.ply"), "--refine", "0", "--no-measure"]) == 0
+    monkeypatch.chdir(run.parent)
+    capsys.readouterr()
+    assert import_([str(tmp_path / "a.ply"), "--data", "capture", "--out", str(tmp_path / "imported")]) == 0
+    assert "--path" not in capsys.readouterr().out
+
+
+def test_a_page_of_a_size_has_room_for_the_photographs_that_there_are(run, tmp_path):
+    plain = ["--format", "html", "--no-measure", "--photographs"]
+    assert export([str(run), *plain, "--out", str(tmp_path / "a.html")]) == 0
+    whole = (tmp_path / "a.html").stat().st_size
+    assert export([str(run), *plain, "--target-mb", str((whole + 8000) / 1e6), "--out", str(tmp_path / "b.html")]) == 0
+    assert (tmp_path / "b.html").stat().st_size <= whole + 8000

@@ -8,6 +8,7 @@ import pytest
 from scene_experts.api import recording
 from scene_experts.arguments.parse import HelpAsked
 from scene_experts.arguments.table import rows
+from scene_experts.cli import main
 from scene_experts.commands.train import FIRST, TrainCommand, after_restart, parse_train, run_of, train
 from scene_experts.core.errors import InputError
 from scene_experts.core.group import Alone
@@ -172,3 +173,13 @@ def test_two_trainings_into_one_folder(tmp_path):
         train(args)
     assert [p.name for p in (tmp_path / "run").iterdir()] == [".lock"]
     assert train(args) == 0
+
+
+def test_a_run_that_is_resumed_where_it_stopped_says_how_to_go_on(tmp_path, capsys):
+    folder = make_capture(tmp_path / "box", views=9, size=(24, 16), points=60).folder
+    words = ["train", "scaffold-gs", "--data", str(folder), "--out", str(tmp_path / "run"), "--iterations", "20", "--stop-at", "10"]
+    assert main([*words, "--device", "cpu", "--preview-every", "0"]) == 0
+    capsys.readouterr()
+    assert main([*words, "--device", "cpu", "--preview-every", "0", "--resume"]) == 0
+    out = capsys.readouterr().out
+    assert "already at iteration 10 of 20" in out and "larger --stop-at than 10 or none" in out and "--init-from" not in out
