@@ -222,3 +222,28 @@ def test_staying_near_photographs_does_not_tip_the_picture_over(tmp_path):
         }""")
         for right, down, asked, below in side:  # the hand moves against what is asked of the camera; what is near goes with it
             assert (right > 0.02 and abs(down) < 0.005) if asked else (down > 0.02 and abs(right) < 0.005), (right, down, asked, below)
+
+
+def test_a_tilted_photograph_of_a_baked_page_comes_level_by_and_by(tmp_path):
+    with browsers(GL, WIDTH, HEIGHT) as make:
+        made = make().open(write(tmp_path / "a.html", "baked"))
+        tab = made.tab
+        tab.wait_for_function(READY)
+        tilt = 0.6  # radians
+        found = tab.evaluate(f"""async () => {{
+          const {{ page }} = window.sceneExperts, camera = page.camera, frame = page.frame;
+          const right = () => camera.up.clone().set(1, 0, 0).applyQuaternion(camera.quaternion).dot(camera.up);
+          page.home();
+          camera.lookAt(page.controls.target);
+          camera.rotateZ({tilt});
+          page.take();
+          const tilts = [];
+          page.frame = () => {{ frame.call(page); tilts.push(right()); }};
+          page.last = performance.now() - 10;
+          page.frame();
+          await window.sceneExperts.settled();
+          return tilts;
+        }}""")
+        level = found[0] / np.sin(0.6 * np.exp(-0.08))  # of the axis that was turned, which need not be at right angles to the vertical
+        assert 0.7 < level <= 1.05 and abs(found[-1]) < 2e-3 and max(found) == found[0] and len(found) > 3
+        assert made.errors == []

@@ -15,6 +15,7 @@ const settings = JSON.parse(document.getElementById("settings").textContent);
 const WIDEST = 100; // degrees, vertical field of view that a narrow screen (a phone) may have to show a whole photograph
 const FLIGHT = 16; // seconds of a round
 const QUIET = 400; // milliseconds of drawing after the last news
+const LEVEL = new Quaternion(); // no roll
 const UNIT = 10 / settings.distance; // the renderer sorts anew when the camera moves by 0.001: scenes are drawn in lengths that suit it
 const veil = document.getElementById("veil"); // hides what lies above and below a photograph, until somebody takes the camera
 veil.style.setProperty("--back", `rgb(${settings.background.map((v) => Math.round(255 * v))})`);
@@ -48,6 +49,7 @@ class Page {
     this.keys = new HeldKeys();
     this.news = this.last = performance.now();
     this.held = true; // an exact pose, until somebody takes the camera
+    this.roll = new Quaternion();
     this.frames = 0;
     this.flight = null; // place on the flight, or null while nobody flies
     this.listen();
@@ -62,9 +64,9 @@ class Page {
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.enableDamping = true;
     this.controls.zoomToCursor = true;
-    this.controls.addEventListener("start", () => { this.held = false; this.flight = null; this.wake(); });
+    this.controls.addEventListener("start", () => { this.take(); this.flight = null; this.wake(); });
     this.controls.addEventListener("change", () => this.wake());
-    canvas.addEventListener("wheel", () => { this.held = false; this.wake(); }, { passive: true });
+    canvas.addEventListener("wheel", () => { this.take(); this.wake(); }, { passive: true });
     canvas.addEventListener("webglcontextlost", () => say("The browser took the graphics away; load the page again"));
     addEventListener("resize", () => this.resize());
     addEventListener("hashchange", (event) => this.readHash(event));
@@ -74,7 +76,7 @@ class Page {
     const buttons = { home: () => this.home(), previous: () => this.step(-1), next: () => this.step(1), whole: fullScreen,
       ask: () => show("help"), close: () => show("help"), flight: () => this.flyAround() };
     this.near = document.getElementById("near"); // whether the camera stays where photographs were taken
-    this.near.addEventListener("change", () => { this.held = false; this.wake(); });
+    this.near.addEventListener("change", () => { this.take(); this.wake(); });
     if (!settings.reach) this.near.parentElement.hidden = !(this.near.checked = false);
     for (const [name, act] of Object.entries(buttons)) document.getElementById(name).addEventListener("click", act);
     document.getElementById("flight").hidden = settings.flight.length < 2;
@@ -154,6 +156,15 @@ class Page {
     this.wake();
   }
 
+  // Leaves the exact pose. The controls know level cameras only: what the pose was turned against one ends by and by.
+  take() {
+    if (!this.held) return;
+    const level = this.camera.clone();
+    level.lookAt(this.controls.target);
+    this.roll = level.quaternion.invert().multiply(this.camera.quaternion);
+    this.held = false;
+  }
+
   // Widens the field of view on a screen that is narrower than the photograph, so that it shows the photograph's whole width.
   fit() {
     this.camera.aspect = innerWidth / innerHeight;
@@ -196,7 +207,7 @@ class Page {
     const flown = this.keys.take();
     if (!flown) return false;
     const move = new Vector3(flown[0], flown[1], -flown[2]);
-    this.held = false;
+    this.take();
     move.applyQuaternion(this.camera.quaternion).multiplyScalar(settings.speed * UNIT);
     this.camera.position.add(move);
     this.controls.target.add(move);
@@ -219,10 +230,15 @@ class Page {
     this.controls.dampingFactor = 1 - Math.exp(-8 * seconds); // by time, so that slow machines come to rest as soon
     this.last = now;
     veil.classList.toggle("on", this.held);
-    if (!this.held) { this.controls.update(); this.stay(target); }
+    if (!this.held) {
+      this.controls.update();
+      this.stay(target);
+      this.camera.quaternion.multiply(this.roll.slerp(LEVEL, this.controls.dampingFactor));
+    }
     this.renderer.render(this.scene, this.camera);
     this.frames += 1;
-    this.running = flying || now - this.news < QUIET || this.spark.sorting || this.spark.sortDirty;
+    const rolling = !this.held && this.roll.angleTo(LEVEL) > 1e-3;
+    this.running = flying || rolling || now - this.news < QUIET || this.spark.sorting || this.spark.sortDirty;
     if (this.running) requestAnimationFrame(() => this.frame());
   }
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.types import Camera
+from scene_experts.data.projection import project
 from scene_experts.data.views import Capture
 
 BLOCK = 8  # px: of the points in one block, the nearest is compared, for the others may be hidden
@@ -66,7 +67,7 @@ def find_ratio(capture: Capture, index: int) -> float | None:
     assert capture.points is not None
     depth = capture.depth(index)
     assert depth is not None
-    columns, rows, z = project(capture.points.xyz, capture.views[index].camera, (depth.shape[1], depth.shape[0]))
+    columns, rows, z = find_pixels(capture.points.xyz, capture.views[index].camera, (depth.shape[1], depth.shape[0]))
     across = depth.shape[1] // BLOCK + 1
     order = z.argsort()
     blocks = ((rows // BLOCK) * across + columns // BLOCK)[order]
@@ -77,12 +78,11 @@ def find_ratio(capture: Capture, index: int) -> float | None:
     return float((z[nearest][known] / there[known]).median()) if int(known.sum()) >= FEWEST else None
 
 
-def project(xyz: Tensor, camera: Camera, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+def find_pixels(xyz: Tensor, camera: Camera, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
     """Return the columns, rows and depths [n] of those points that a camera sees, in a picture of
     `size` of all that it shows."""
-    pose = camera.world_to_cam.double()
-    x, y, z = (xyz.double() @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
-    columns = ((x / z * camera.fx + camera.cx) * (size[0] / camera.width)).floor()
-    rows = ((y / z * camera.fy + camera.cy) * (size[1] / camera.height)).floor()
+    u, v, z = project(xyz, camera)
+    columns = (u * (size[0] / camera.width)).floor()
+    rows = (v * (size[1] / camera.height)).floor()
     seen = (z > camera.near) & (columns >= 0) & (columns < size[0]) & (rows >= 0) & (rows < size[1])
     return columns[seen].long(), rows[seen].long(), z[seen]

@@ -14,9 +14,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from torch import Tensor
 
 from scene_experts.core.types import Points
 from scene_experts.data.dense.cells import SizedPoints, fuse, thin
+from scene_experts.data.projection import project
 from scene_experts.data.views import Capture, Frame, View
 
 CELLS = 25  # along the longer side of a picture; each gets at most one point
@@ -51,11 +53,11 @@ def add_far_points(capture: Capture, times: float) -> FarPoints | None:
     """
     if capture.points is None or len(capture.points.xyz) == 0:
         return None
-    xyz = capture.points.xyz.double().numpy()
+    own = capture.points
     parts, holes, cells = [], 0, 0
     for index in capture.train:
         view = capture.views[index]
-        hole, depth = find_holes(view, xyz)
+        hole, depth = find_holes(view, own.xyz)
         cells += hole.size
         if depth is not None and hole.any():
             found = _lift(view, hole, depth * times, capture.frame(index))
@@ -64,34 +66,33 @@ def add_far_points(capture: Capture, times: float) -> FarPoints | None:
     if not holes:
         return None
     cloud = fuse(SizedPoints.join(parts), 1.0)
-    most = max(1, int(PART * len(xyz)))
+    most = max(1, int(PART * len(own.xyz)))
     if len(cloud) > most:
         cloud, _ = thin(cloud, most)
-    own = capture.points
     far = torch.from_numpy(cloud.xyz).to(own.xyz), torch.from_numpy(cloud.rgb.clip(0, 255).round().astype(np.uint8)).to(own.rgb)
-    return FarPoints(Points(torch.cat([own.xyz, far[0]]), torch.cat([own.rgb, far[1]])), len(cloud), holes / cells, find_box(xyz))
+    return FarPoints(Points(torch.cat([own.xyz, far[0]]), torch.cat([own.rgb, far[1]])), len(cloud), holes / cells, find_box(own.xyz))
 
 
-def find_box(xyz: NDArray[np.float64]) -> tuple[float, ...]:
+def find_box(points: Tensor) -> tuple[float, ...]:
     """Return the low and the high corner of a box around the points [n, 3], but for those outside of
     quantiles of their coordinates. It leaves room on each side as wide as its widest."""
+    xyz = points.double().numpy()
     low, high = np.quantile(xyz, OUTSIDE, axis=0), np.quantile(xyz, 1 - OUTSIDE, axis=0)
     room = float((high - low).max())
     return tuple(float(f"{side:.4g}") for side in (*(low - room), *(high + room)))  # the same on all processors
 
 
-def find_holes(view: View, xyz: NDArray[np.float64]) -> tuple[NDArray[np.bool_], float | None]:
+def find_holes(view: View, xyz: Tensor) -> tuple[NDArray[np.bool_], float | None]:
     """Return the cells [rows, columns] of a picture that show none of the points [n, 3], nor do
     those around them, and the farthest depth that it shows; None if too few points say it."""
     camera = view.camera
     longer = max(camera.width, camera.height)
     columns, rows = (max(1, round(CELLS * side / longer)) for side in (camera.width, camera.height))
-    pose = camera.world_to_cam.double().numpy()
-    x, y, z = (xyz[:, :1] * pose[:3, 0] + xyz[:, 1:2] * pose[:3, 1] + xyz[:, 2:] * pose[:3, 2] + pose[:3, 3]).T
+    u, v, z = (found.numpy() for found in project(xyz, camera))
     ahead = z > 0
-    x, y, z = x[ahead], y[ahead], z[ahead]
-    column = np.floor((camera.fx * x / z + camera.cx) * (columns / camera.width))
-    row = np.floor((camera.fy * y / z + camera.cy) * (rows / camera.height))
+    z = z[ahead]
+    column = np.floor(u[ahead] * (columns / camera.width))
+    row = np.floor(v[ahead] * (rows / camera.height))
     seen = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
     if int(seen.sum()) < FEWEST:
         return np.zeros((rows, columns), dtype=np.bool_), None

@@ -14,6 +14,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.reading.budget import HEAD
 from scene_experts.core.reading.source import opening
 from scene_experts.core.types import Camera, Points
+from scene_experts.data.projection import project
 from scene_experts.data.readers import ply
 from scene_experts.data.readers.colmap_model import read_points as read_colmap_points
 
@@ -68,11 +69,8 @@ def check_frame(points: Points, cameras: Sequence[Camera], path: Path) -> list[s
     xyz = points.xyz.double()[:: max(1, len(points.xyz) // _SAMPLED)]
     seen = torch.zeros(len(xyz), dtype=torch.bool)
     for camera in cameras:
-        pose, K = camera.world_to_cam.double(), camera.K.double()
-        local = xyz @ pose[:3, :3].T + pose[:3, 3]
-        at = local[:, :2] / local[:, 2:].clamp_min(1e-12) * torch.stack((K[0, 0], K[1, 1])) + K[:2, 2]
-        limit = torch.tensor([camera.width, camera.height])
-        seen |= (local[:, 2] > 0) & (at >= 0).all(1) & (at <= limit).all(1)
+        u, v, z = project(xyz, camera)
+        seen |= (z > 0) & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
     share = float(seen.double().mean())
     if share >= _SEEN:
         return []

@@ -26,6 +26,7 @@ from scene_experts.files.registry import (
     formats_of,
     recognise,
 )
+from scene_experts.files.result_folder import is_result
 from scene_experts.files.scene_folder import origin_note, origin_of, tell_origin, trained_in, width_in, world_of, write_scene_folder
 from scene_experts.files.standard import NOTE_FORMAT, ExportTask, Made, Written, export_gaussians
 from scene_experts.render import Rasterizer
@@ -293,6 +294,8 @@ def _view_note(work: ExportTask, capture: Capture | None, world: World) -> Note:
 def _export_folder(work: ExportTask, family: Family, world: World, out: Path) -> Written:
     run = work.run
     cameras = run.path / "cameras.json"
+    if out != run.path and not is_result(out) and (out / cameras.name).exists():
+        raise InputError(f"expected no {cameras.name} in {out}, which is no result folder, found one; name another folder with --out")
     folder = write_scene_folder(run, family, world, out, width_in(cameras) if cameras.is_file() else None)
     if out != run.path and cameras.is_file():
         write_bytes(out / "cameras.json", cameras.read_bytes())

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import torch
-
 from scene_experts.data.capture import Capture
+from scene_experts.data.projection import project
 from scene_experts.training.config import RunConfig
 
 SHARE = 0.01  # of a view's points that may be nearer than its nearest depth: some are wrong
@@ -44,10 +43,8 @@ def find_nearest(capture: Capture) -> float | None:
         return None
     found = []
     for view in (capture.views[i] for i in capture.train):
-        camera = view.camera.to(dtype=torch.float64)
-        x, y, z = (capture.points.xyz @ camera.world_to_cam[:3, :3].T + camera.world_to_cam[:3, 3]).T
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        depth = z[(z > 0) & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)]
+        u, v, z = project(capture.points.xyz, view.camera)
+        depth = z[(z > 0) & (u >= 0) & (u <= view.camera.width) & (v >= 0) & (v <= view.camera.height)]
         if len(depth) >= FEWEST:
             found.append(float(depth.kthvalue(1 + int(SHARE * len(depth))).values))
     return min(found, default=None)

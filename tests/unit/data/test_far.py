@@ -45,15 +45,15 @@ def holes_by_hand(view, xyz):
 def test_holes_by_hand(capture):
     some = half_seen(capture)
     xyz = some.points.xyz.double().numpy()
-    hole, depth = find_holes(some.views[0], xyz)
+    hole, depth = find_holes(some.views[0], torch.from_numpy(xyz))
     expected, farthest = holes_by_hand(some.views[0], xyz)
     assert np.array_equal(hole, expected) and hole.any() and not hole.all() and depth == pytest.approx(farthest)
-    assert find_holes(some.views[0], xyz[:5])[1] is None
+    assert find_holes(some.views[0], torch.from_numpy(xyz[:5]))[1] is None
 
 
 def test_points_lie_in_the_holes_at_their_depth_with_their_colours(capture):
     some = half_seen(capture)
-    hole, depth = find_holes(some.views[0], some.points.xyz.double().numpy())
+    hole, depth = find_holes(some.views[0], some.points.xyz)
     found = add_far_points(some, 5.0)
     own, camera = len(some.points.xyz), some.views[0].camera
     assert torch.equal(found.points.xyz[:own], some.points.xyz) and torch.equal(found.points.rgb[:own], some.points.rgb)
@@ -74,7 +74,7 @@ def test_every_hole_has_its_point_where_there_is_room(capture, monkeypatch):
     monkeypatch.setattr("scene_experts.data.far.PART", 10.0)
     monkeypatch.setattr("scene_experts.data.far.fuse", lambda cloud, edge: cloud)
     some = half_seen(capture)
-    hole, _ = find_holes(some.views[0], some.points.xyz.double().numpy())
+    hole, _ = find_holes(some.views[0], some.points.xyz)
     found = add_far_points(some, 5.0)
     assert found.added == hole.sum()
     rgb = some.frame(0).rgb.numpy().astype(float).reshape(hole.shape[0], 4, CELLS, 4, 3).mean((1, 3))

@@ -139,6 +139,16 @@ def test_written_and_read_back_it_draws_the_same_picture(run, tmp_path, form):
     capture.images.close()
 
 
+def test_a_list_of_cameras_of_something_else_stays(run, tmp_path):
+    own = tmp_path / "cameras.json"
+    own.write_text("[]")
+    with pytest.raises(InputError, match="no cameras.json in .* name another folder"):
+        export_run(run.path, "anchors", tmp_path)
+    assert own.read_text() == "[]" and not (tmp_path / "point_cloud").exists()
+    export_run(run.path, "anchors", tmp_path / "new")
+    export_run(run.path, "anchors", tmp_path / "new")  # its own are replaced
+
+
 def test_a_folder_of_another_name_keeps_its_step(run, tmp_path):
     """Experts are drawn by the step: all of them at its beginning."""
     (tmp_path / "shared").symlink_to(run.path / "point_cloud" / f"iteration_{STEPS}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +20,7 @@ from scene_experts.files.select import parse_crop
 from scene_experts.render import Rasterizer
 from scene_experts.training.run_folder import OpenRun
 
+log: logging.Logger = logging.getLogger(__name__)
 MOST_VIEWS = 200  # evenly chosen
 INNER = (0.02, 0.98)  # quantiles of the points seen, along each axis, that the mesh reaches to without --crop
 SAMPLED = 4  # every nth pixel decides where they are
@@ -49,6 +51,12 @@ def make_mesh(task: MeshTask) -> tuple[Mesh, dict[str, Any]]:
     if not inside.any():
         where = " inside --crop" if task.crop else ""
         raise InputError(f"expected opaque surfaces{where} in the training views, found none; train longer, or correct --crop")
+    if not task.crop and not inside.all():
+        log.warning(
+            "%.0f %% of what the views show lies farther from the capture's points than their width, and is left out as a background; "
+            "--crop chooses otherwise",
+            100 * float(1 - inside.mean()),
+        )
     points = points[inside]
     low, high = (np.min(points, 0), np.max(points, 0)) if task.crop else np.quantile(points, INNER, axis=0)
     voxel = float((high - low).max()) / task.cells
@@ -87,7 +95,7 @@ def _inside(task: MeshTask, points: Points) -> NDArray[np.bool_]:
         capture = task.capture
         if not task.run.config.train.far_points or capture.points is None or capture.random_points:
             return np.ones(len(points), np.bool_)
-        low, high = np.reshape(find_box(capture.points.xyz.double().numpy()), (2, 3))
+        low, high = np.reshape(find_box(capture.points.xyz), (2, 3))
         return np.asarray(((points >= low) & (points <= high)).all(1), dtype=np.bool_)
     return parse_crop(task.crop).contains(torch.from_numpy(_to_input(task.capture, points)), task.capture).numpy()
 

@@ -83,16 +83,17 @@ def test_what_cannot_be_is_refused(run, tmp_path):
         export(run, "mesh", tmp_path / "b.obj")
 
 
-def test_a_background_of_points_far_away_is_no_surface(run):
+def test_a_background_of_points_far_away_is_no_surface(run, caplog):
     capture = run_folder.capture_of(run)
     assert capture.points is not None
     xyz, rgb = capture.points.xyz, capture.points.rgb
     near = (xyz - xyz.median(0).values).norm(dim=1).argsort()[:10]
     some = replace(capture, points=Points(xyz[near], rgb[near]))
-    low, high = np.reshape(find_box(xyz[near].double().numpy()), (2, 3))
+    low, high = np.reshape(find_box(xyz[near]), (2, 3))
     far = replace(run, config=replace(run.config, train=replace(run.config.train, far_points=5.0)))
     plain, bounded = (
         make_mesh(MeshTask(trained, some, 24, None, None, silent))[1]["voxel"] * capture.world.scale for trained in (run, far)
     )
+    assert "left out as a background" in caplog.text and caplog.text.count("--crop") == 1
     assert bounded < plain and 24 * bounded <= float((high - low).max()) + 1e-6
     capture.images.close()
