@@ -94,6 +94,7 @@ def fit_code(
     for i in range(STEPS):
         codes.fitted[camera.id] = code
         image = rasterize(scene(camera, step, Mode.DRAW, rasterize.visible).gaussians, camera, background).image
+        image = scene.as_photographed(image, camera)  # as it is scored
         loss = ((image.clamp(0, 1) - photo).abs() * counts[..., None]).sum() / area
         if loss.item() < least:
             best, least = code.detach().clone(), loss.item()

@@ -12,6 +12,7 @@ from scene_experts.evaluate import halves
 from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.score import evaluate
 from scene_experts.render import choose
+from scene_experts.scene.exposure import Exposures
 from scene_experts.training.recipes import RECIPES
 from support.captures import load
 from support.synthetic import make_capture
@@ -43,13 +44,17 @@ def test_halves_share_no_pixel():
     assert halves.right_half(mask, 4, 6).sum() == 4
 
 
-def test_the_code_is_fitted_to_the_left_half_only(capture):
+@pytest.mark.parametrize("stops", [None, 1.5])
+def test_the_code_is_fitted_to_the_left_half_only(capture, stops):
     scene, draw = started(capture), choose("auto", "cpu", deterministic=True)
+    if stops is not None:
+        scene.exposures = Exposures([capture.views[i].camera for i in capture.train])
+        scene.exposures.stops.data[: len(capture.train) // 2] = stops
     camera, black = capture.views[capture.test[0]].camera, torch.zeros(3)
     code = scene.codes.table[2].detach() * 1.5
     scene.codes.fitted[camera.id] = code
     with torch.no_grad():
-        photo = draw(scene(camera, STEP, Mode.DRAW, draw.visible).gaussians, camera, black).image.clamp(0, 1)
+        photo = scene.as_photographed(draw(scene(camera, STEP, Mode.DRAW, draw.visible).gaussians, camera, black).image, camera).clamp(0, 1)
     left = halves.left_half(camera.height, camera.width)
     misled = photo.clone()
     misled[:, camera.width // 2 :] = torch.rand_like(misled[:, camera.width // 2 :])  # pixels that do not count have no effect
@@ -59,7 +64,8 @@ def test_the_code_is_fitted_to_the_left_half_only(capture):
     for name, value in (("mean", scene.codes.table.detach().mean(0)), ("found", found)):
         scene.codes.fitted[camera.id] = value
         with torch.no_grad():
-            image = draw(scene(camera, STEP, Mode.DRAW, draw.visible).gaussians, camera, black).image.clamp(0, 1)
+            image = draw(scene(camera, STEP, Mode.DRAW, draw.visible).gaussians, camera, black).image
+            image = scene.as_photographed(image, camera).clamp(0, 1)
         errors[name] = float((image - photo).abs()[:, camera.width // 2 :].mean())  # on the other half
     assert errors["found"] < 0.35 * errors["mean"], errors
     assert all(torch.equal(before[name], p) and p.grad is None for name, p in scene.named_parameters())
