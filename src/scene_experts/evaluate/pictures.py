@@ -112,10 +112,15 @@ class Writer:
 
     def __exit__(self, kind: object, *_: object) -> None:
         try:
-            while kind is None and self._pending:
-                self._pending.popleft().result()
+            if kind is None:
+                self.finish()
         finally:
             self._threads.shutdown(cancel_futures=True)
+
+    def finish(self) -> None:
+        """Wait until all pictures are written."""
+        while self._pending:
+            self._pending.popleft().result()
 
     def submit(self, work: Callable[[], None]) -> None:
         """Call `work`, which writes pictures, in a thread."""

@@ -108,7 +108,12 @@ def evaluate(
             tell("rendering and scoring", n + 1, len(chosen))
             return {"file": file, **scores, **facts}
 
-        parts = group.gather_values((group.agree(lambda: {n: score_view(n) for n in mine}), perceptual.absent))
+        def score_views() -> dict[int, dict[str, Any]]:
+            scored = {n: score_view(n) for n in mine}
+            writer.finish()  # before process 0 gives the folder its name
+            return scored
+
+        parts = group.gather_values((group.agree(score_views), perceptual.absent))
         if not group.first:
             return {}
         per_view = collect(parts, [capture.views[index].name for index in chosen], perceptual)

@@ -72,6 +72,7 @@ class _Parts:
     networks: dict[str, Tensor] = field(default_factory=dict)  # those of the first block, and of each
     lattice: dict[str, Any] = field(default_factory=dict)  # the same
     poses: str = ""
+    box: tuple[float, ...] = ()  # in which the runs created rows, from the run that all began with
     step: int = 0
     seconds: float = 0.0
 
@@ -93,7 +94,7 @@ class _Parts:
             kind = "params" if name in scene.table.params else "facts"
             self.columns.setdefault(f"{kind}.{name}", []).append(column.detach()[rows])
         self.configs.append(run.config)
-        self.poses = self.poses or run.poses
+        self.poses, self.box = self.poses or run.poses, self.box or run.box
         self.step, self.seconds = max(self.step, run.step), self.seconds + run.clock.seconds
 
     def _check(self, run: OpenRun, path: Path) -> None:
@@ -118,6 +119,7 @@ class _Parts:
             tensors["facts.slots"] = torch.cat(self.slots)
         config = self.configs[0]
         meta = {"recipe": config.train.recipe, "step": self.step, "seconds": self.seconds, "capture": self.fingerprint, "poses": self.poses}
+        meta |= {"box": list(self.box)} if self.box else {}
         checkpoint.save(out / "checkpoints", self.step, tensors, {**self.lattice, **meta, "config": "imported"})
 
 

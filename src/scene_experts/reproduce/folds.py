@@ -74,12 +74,27 @@ def _by_training(records: Sequence[Record]) -> dict[tuple[str, str, int], dict[s
 
 def _join(parts: Sequence[Record]) -> Record:
     per_view = {name: scores for part in parts for name, scores in part.per_view.items()}
-    results = _average([part.results for part in parts]) | {"view_count": len(per_view)}
+    results = _average([{**part.results, **_ranked(part.results)} for part in parts]) | {"view_count": len(per_view)}
+    scored = [view for view in per_view.values() if "psnr" in view]  # others are masked wholly
     for metric in MEANS:
-        scores = [view[metric] for view in per_view.values() if metric in view]
-        results[metric] = fmean(scores) if len(scores) == len(per_view) else None
+        scores = [view[metric] for view in scored if metric in view]
+        results[metric] = fmean(scores) if scores and len(scores) == len(scored) else None
     fits = [part.fit for part in parts if part.fit is not None]
     return replace(parts[0], results=results, per_view=per_view, fit=fmean(fits) if len(fits) == len(parts) else None)
+
+
+def _ranked(results: dict[str, Any]) -> dict[str, Any]:
+    """Return the shares of the experts of a training, of each attribute from the busiest to the least
+    busy: in another fold, the expert of a number is another one."""
+    found = {}
+    for attribute, shares in (results.get("experts") or {}).items():
+        by = shares.get("share") or shares.get("mean_gate") or []
+        order = sorted(range(len(by)), key=lambda expert: -by[expert])
+        found[attribute] = {
+            name: [value[expert] for expert in order] if isinstance(value, list) and len(value) == len(order) else value
+            for name, value in shares.items()
+        }
+    return {"experts": found} if found else {}
 
 
 def _average(values: Sequence[Any]) -> Any:

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import torch
 
+from scene_experts.core.errors import InputError
+from scene_experts.core.fields import flag_of
 from scene_experts.core.io import write_bytes
 from scene_experts.data import capture as captures
 from scene_experts.evaluate import pictures
@@ -22,7 +24,9 @@ from scene_experts.reproduce.plan import OWN, CaptureSpec, Spec, code_of
 from scene_experts.reproduce.statistics import SEED_SD, SEED_WEIGHT, on_common_scenes
 from scene_experts.reproduce.store import Record
 from scene_experts.training import run_folder
+from scene_experts.training.background import with_background
 from scene_experts.training.config import SCHEDULE
+from scene_experts.training.nearest import with_near_plane
 
 SHORT = 2000  # iterations; shorter trainings hardly pass the dense warm-up
 DISJOINT = "No scene has runs of every row: each mean is over the scenes of its own row, so do not compare these rows."
@@ -163,6 +167,22 @@ def draw_experts(spec: Spec, run: Path, out: Path, attribute: str = "color") -> 
 
 def adopt(run: Path, folder: Path) -> Path:
     """Write the record of a run folder that another command trained. Its scene is the name of its
-    capture."""
+    capture.
+
+    Raises InputError for a background or a near plane that are not those of the recipe: records take
+    them for those.
+    """
     config = run_folder.read_config(run)
+    train, data = config.train, config.data
+    if train.mean_background or train.near_share:
+        asked = replace(data, background=None if train.mean_background else data.background, near=None if train.near_share else data.near)
+        capture = captures.load(asked, train.seed)
+        found, _ = with_near_plane(*with_background(replace(config, data=asked), capture))
+        capture.images.close()
+        for name in ("background", "near"):
+            own, other = getattr(found.data, name), getattr(data, name)
+            if own != other:
+                raise InputError(
+                    f"expected the {name} that the recipe has on this capture, {own}, found {other} in {run}; train it without {flag_of(name)}"
+                )
     return store.write(folder, store.read_run(run, captures.name_capture(Path(config.data.path)), code_of(config.train)))

@@ -31,7 +31,7 @@ def start_from(cfg: Train, run: Path, capture: Capture, device: str, now: RunCon
     folder, at its iteration.
 
     The scene has its averaged weights, if there are any. The optimiser, the statistics and the
-    order of the views start anew. now: The configuration of the new run, with the settings
+    order of the views start anew; rows are created where that run created them. now: The configuration of the new run, with the settings
     before scaling.
 
     Raises InputError if the run has no checkpoint, another recipe, capture, world or scene, or
@@ -57,7 +57,7 @@ def start_from(cfg: Train, run: Path, capture: Capture, device: str, now: RunCon
         if other := _changes(before.train.scene, now.train.scene, "scene"):
             raise InputError(f"expected a scene of the kind that {run} of --init-from has{other}; use the flags of that run") from error
         raise
-    training.step = int(meta["step"])
+    training.step, training.box = int(meta["step"]), tuple(meta.get("box", ()))
     return training
 
 

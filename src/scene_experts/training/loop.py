@@ -172,8 +172,8 @@ def iterate(training: Training, run: Job, capture: Capture, rasterize: Rasterize
     if rate is not None:
         term, rows = rate.add_gradients(scene, training.step), None
         done = replace(done, terms={**done.terms, "rate": term})
-    if any(cfg.growth.reads(number) for number in numbers):
-        exchange.complete()
+    if any(cfg.growth.reads(number) for number in numbers) or (rate is not None and rate.drops(training.step, cfg.batch)):
+        exchange.complete()  # while the statistics have the rows of the table
     limited, before = run.max_memory > 0 and any(cfg.growth.adds(number) for number in numbers), len(scene.table)
     if limited:
         give_back()

@@ -187,10 +187,14 @@ class RateTerm:
         slots, anchors = max(int(opened.sum()), 1), max(int(opened.any(1).sum()), 1)
         return float(bits[:, own:].sum()) / slots, float(bits[:, :own].sum()) / anchors
 
+    def drops(self, step: int, views: int) -> bool:
+        """Return whether closed anchors are removed at the end of the iteration."""
+        return passes(step, views, EVERY)
+
     def drop_closed(self, scene: Scene, step: int, views: int) -> int:
         """Remove the anchors without an open slot, every 250 iterations. Returns their number.
         Raises RunError if none would be left."""
-        if not passes(step, views, EVERY):
+        if not self.drops(step, views):
             return 0
         closed = ~(scene.table.params[KEEP].detach() > 0).any(1)
         if bool(closed.all()):

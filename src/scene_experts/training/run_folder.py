@@ -58,6 +58,7 @@ class OpenRun:
     clock: Clock  # of the training
     capture: str = ""  # fingerprint of the capture that the run was trained on; empty if unknown
     poses: str = ""  # of that capture, see `Capture.poses`; empty if unknown
+    box: tuple[float, ...] = ()  # as `Training.box`
     lone: Lone | None = None  # for a scene of a file; None for a run folder
 
     @property
@@ -306,6 +307,7 @@ def open_run(run: Path, device: str = "cpu", step: int | None = None) -> OpenRun
         scene = restore_foreign(config.train.scaled_scene(), tensors, meta, averaged=True)
         scene.exposures, scene.poses = Exposures.restore(tensors), Poses.restore(tensors)
         opened = OpenRun(run, config, scene, int(meta["step"]), Clock.of(meta), meta.get("capture", ""), meta.get("poses", ""))
+        opened = replace(opened, box=tuple(meta.get("box", ())))
     return replace(opened, scene=scene.to(device))
 
 

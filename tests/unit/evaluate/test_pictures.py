@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from functools import partial
 from pathlib import Path
 
@@ -122,6 +124,11 @@ def test_a_writer_does_all_work_and_raises_what_a_thread_raised(tmp_path: Path) 
         for i in range(2 * pictures.PENDING):
             writer.submit(partial(pictures.write_picture, tmp_path / f"{i}.png", pixels + i, sync=False))
     assert all(np.array_equal(pictures.read_picture(tmp_path / f"{i}.png"), pixels + i) for i in range(2 * pictures.PENDING))
+    slow = threading.Event()
+    with pictures.Writer() as writer:
+        writer.submit(lambda: time.sleep(0.2) or slow.set())
+        writer.finish()
+        assert slow.is_set()
     (tmp_path / "file").touch()
     with pytest.raises(RunError, match="file"), pictures.Writer() as writer:
         writer.submit(partial(pictures.write_picture, tmp_path / "file" / "a.png", pixels))

@@ -8,6 +8,7 @@ import pytest
 from scene_experts import cli
 from scene_experts.data.settings import Data
 from scene_experts.reproduce import store
+from scene_experts.reproduce.claims import busiest
 from scene_experts.reproduce.folds import check_folds, find_incomplete, hold_out_each, join
 from scene_experts.reproduce.plan import CaptureSpec
 from scene_experts.reproduce.statistics import difference
@@ -39,6 +40,23 @@ def test_the_joined_record_has_the_scores_of_all_views_and_the_means_of_the_rest
     assert joined.results["psnr"] == pytest.approx((31 + 32 + 32 + 33) / 4)  # over views, not over folds
     assert joined.value("size_mb") == pytest.approx(20) and joined.results["experts"]["cov"]["share"] == [0.5, 0.5]
     assert joined.results["odd"] == "same" and joined.results["other"] is None and joined.value("lpips") is None
+
+
+def test_experts_of_folds_are_joined_by_rank_and_not_by_number():
+    shares = ([0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.05, 0.05, 0.9])
+    made = [replace(one, results={**one.results, "experts": {"cov": {"share": s, "first": s, "k": 2}}}) for one, s in zip(parts(), shares)]
+    (joined,) = join(made, 3)
+    assert joined.results["experts"]["cov"] == {"share": pytest.approx([0.9, 0.05, 0.05]), "first": pytest.approx([0.9, 0.05, 0.05]), "k": 2}
+    assert busiest(joined) == pytest.approx(2.7)
+
+
+def test_a_view_that_is_masked_wholly_has_no_part_in_the_means():
+    made = parts()
+    made[0] = replace(made[0], per_view={**made[0].per_view, "masked": {}})
+    (joined,) = join(made, 3)
+    assert joined.results["psnr"] == pytest.approx((31 + 32 + 32 + 33) / 4) and joined.results["view_count"] == 5
+    without = {name: {key: value for key, value in view.items() if key != "ssim"} for name, view in made[1].per_view.items()}
+    assert join([made[0], replace(made[1], per_view=without), made[2]], 3)[0].results["ssim"] is None
 
 
 def test_a_training_without_one_of_its_folds_is_left_out():

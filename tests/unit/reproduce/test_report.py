@@ -2,12 +2,15 @@
 
 import pytest
 
+from scene_experts.cli import main
+from scene_experts.core.errors import InputError
 from scene_experts.reproduce import report
 from scene_experts.reproduce.compare import make_comparison
 from scene_experts.reproduce.experiments import EXPERIMENTS
 from scene_experts.reproduce.options import ReproduceOptions
 from scene_experts.reproduce.plan import OWN, CaptureSpec
 from support.records import record
+from support.synthetic import make_capture
 
 pytest.importorskip("matplotlib")
 
@@ -69,3 +72,13 @@ def test_the_longer_schedule_of_octree_gs_does_not_hide_that_the_others_are_shor
     scaled = [record("moe-gs", iterations=22_500), record("octree-gs", iterations=30_000)]  # --scale 0.75
     assert "22,500 iterations" in report.caveat(scaled)[0]
     assert report.caveat([record("moe-gs", iterations=30_000), record("octree-gs", iterations=40_000)]) == []
+
+
+def test_a_run_with_a_background_or_a_near_plane_of_its_own_is_not_adopted(tmp_path):
+    words = ["--data", str(make_capture(tmp_path / "box", views=9, size=(48, 32), points=300).folder), "--iterations", "4"]
+    words += ["--mean-background", "--near-share", "0.5", "--device", "cpu", "--preview-every", "0"]
+    for name, own in (("plain", []), ("background", ["--background", "1", "1", "1"]), ("near", ["--near", "0.123"])):
+        assert main(["train", "scaffold-gs", "--out", str(tmp_path / name), *words, *own]) == 0
+        why = "expected an evaluated run" if name == "plain" else f"expected the {name} that the recipe has .* without --{name}"
+        with pytest.raises(InputError, match=why):
+            report.adopt(tmp_path / name, tmp_path / "records")

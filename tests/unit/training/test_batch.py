@@ -10,15 +10,18 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError, RunError
+from scene_experts.core.group import Alone
+from scene_experts.core.schedule import Every
 from scene_experts.data.settings import Data
 from scene_experts.render import choose
+from scene_experts.scene.anchors.quantise import KEEP
 from scene_experts.training.average import Average
-from scene_experts.training.batch import check_batch
+from scene_experts.training.batch import Reduced, check_batch
 from scene_experts.training.config import RunConfig
 from scene_experts.training.config import check as check_train
 from scene_experts.training.events import Densified, Previewed, Started, Stepped, Stopped
 from scene_experts.training.job import Job
-from scene_experts.training.loop import iterate
+from scene_experts.training.loop import for_training, iterate
 from scene_experts.training.state import Training
 from support.captures import load
 from support.groups import run_group
@@ -96,6 +99,24 @@ def test_unordered_sums_differ_by_rounding_alone(folder, tmp_path):
     assert torch.allclose(one["network.opacity.w1"], two["network.opacity.w1"], rtol=1e-2, atol=1e-3)
     for name in ("visits", "count", "grad"):
         assert float(one[f"stats.{name}"].sum()) == pytest.approx(float(two[f"stats.{name}"].sum()), rel=1e-2)
+
+
+def test_statistics_of_several_processes_outlive_anchors_that_the_rate_drops(folder):
+    capture = load(folder)
+    cfg = config("scaffold-gs", iterations=1000, schedule=1000, rate=0.02)
+    cfg = replace(cfg, growth=replace(cfg.growth, adjust=Every(260, 900, 280), start_stat=240))  # observes across the removal at 250
+    job = Job(RunConfig(cfg, Data(folder)))
+    training = Training.start(cfg, capture, "cpu")
+    training.rate.first, before, rasterize = 230, len(training.scene.table), for_training(choose("auto", "cpu"), False)
+    training.step, exchange = 238, Reduced(training, Alone(), [])
+    for _ in range(11):
+        iterate(training, job, capture, rasterize, exchange)
+    with torch.no_grad():
+        training.scene.table.params[KEEP][:3] = -1e3  # closed
+    for _ in range(40):
+        iterate(training, job, capture, rasterize, exchange)
+    assert training.step == 289 and len(training.scene.table) < before
+    capture.images.close()
 
 
 def test_a_request_to_stop_one_process_saves_and_stops_all(folder, tmp_path):

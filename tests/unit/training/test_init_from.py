@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from scene_experts import cli
+from scene_experts.core import checkpoint
 from scene_experts.core.errors import InputError
 from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
@@ -36,11 +37,16 @@ def test_a_training_starts_from_exactly_the_scene_of_another(tmp_path):
     training = start_from(cfg.scaled(), tmp_path / "run", capture, "cpu", RunConfig(cfg, Data(folder)))
     capture.images.close()
     scene = open_run(tmp_path / "run").scene
-    assert training.step == 20 and not training.optimizer.state
+    assert training.step == 20 and not training.optimizer.state and training.box == ()
     for name, value in scene.table.columns().items():
         assert torch.equal(training.scene.table.columns()[name].detach(), value.detach()), name
     for name, value in scene.network_tensors().items():
         assert torch.equal(training.scene.network_tensors()[name], value), name
+    tensors, meta = checkpoint.newest(tmp_path / "run" / "checkpoints")
+    bounds = (-1.0, -1.5, -2.0, 1.0, 1.5, 2.0)  # of points far away
+    checkpoint.save(tmp_path / "run" / "checkpoints", 20, tensors, {**meta, "box": list(bounds)})
+    training = start_from(cfg.scaled(), tmp_path / "run", capture, "cpu", RunConfig(cfg, Data(folder)))
+    assert training.box == open_run(tmp_path / "run").box == bounds
     for iterations, batch in ((20, 1), (60, 6)):
         with pytest.raises(InputError, match="--iterations"):
             other = replace(cfg, iterations=iterations, batch=batch)
