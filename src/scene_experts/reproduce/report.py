@@ -180,9 +180,8 @@ def adopt(run: Path, folder: Path) -> Path:
         found, _ = with_near_plane(*with_background(replace(config, data=asked), capture))
         capture.images.close()
         for name in ("background", "near"):
-            own, other = getattr(found.data, name), getattr(data, name)
-            if own != other:
-                raise InputError(
-                    f"expected the {name} that the recipe has on this capture, {own}, found {other} in {run}; train it without {flag_of(name)}"
-                )
+            right, other = getattr(found.data, name), getattr(data, name)
+            if right != other:
+                expected = f"the {name} that the recipe has on this capture, {right}"
+                raise InputError(f"expected {expected}, found {other} in {run}; train it without {flag_of(name)}")
     return store.write(folder, store.read_run(run, captures.name_capture(Path(config.data.path)), code_of(config.train)))

@@ -142,7 +142,7 @@ def test_written_and_read_back_it_draws_the_same_picture(run, tmp_path, form):
 def test_a_list_of_cameras_of_something_else_stays(run, tmp_path):
     own = tmp_path / "cameras.json"
     own.write_text("[]")
-    with pytest.raises(InputError, match="no cameras.json in .* name another folder"):
+    with pytest.raises(InputError, match=r"no cameras\.json in .* name another folder"):
         export_run(run.path, "anchors", tmp_path)
     assert own.read_text() == "[]" and not (tmp_path / "point_cloud").exists()
     export_run(run.path, "anchors", tmp_path / "new")

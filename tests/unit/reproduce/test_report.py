@@ -79,6 +79,6 @@ def test_a_run_with_a_background_or_a_near_plane_of_its_own_is_not_adopted(tmp_p
     words += ["--mean-background", "--near-share", "0.5", "--device", "cpu", "--preview-every", "0"]
     for name, own in (("plain", []), ("background", ["--background", "1", "1", "1"]), ("near", ["--near", "0.123"])):
         assert main(["train", "scaffold-gs", "--out", str(tmp_path / name), *words, *own]) == 0
-        why = "expected an evaluated run" if name == "plain" else f"expected the {name} that the recipe has .* without --{name}"
+        why = "expected an evaluated run" if name == "plain" else rf"expected the {name} that the recipe has .* without --{name}"
         with pytest.raises(InputError, match=why):
             report.adopt(tmp_path / name, tmp_path / "records")
