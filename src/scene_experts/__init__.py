@@ -103,7 +103,10 @@ def __getattr__(name: str) -> object:
     """Load a public name from its module (PEP 562)."""
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from scene_experts.arguments.docs import explain
+
     value = getattr(importlib.import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+    explain(value)
     globals()[name] = value
     return value
 

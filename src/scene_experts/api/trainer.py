@@ -56,6 +56,7 @@ class Trainer:
         device: Device = "auto",
         rasterizer: Raster = "auto",
         save_every: int = 5000,
+        keep_checkpoints: int = 2,
         preview_every: int = 1000,
         log_every: int = 10,
         max_memory: float = 0.0,
@@ -80,6 +81,8 @@ class Trainer:
             rasterizer: "cpu" (compiled), "gsplat" (CUDA), "reference" (plain torch, slow), or
                 "auto" (the fastest on the device).
             save_every: Iterations between checkpoints, at least 1.
+            keep_checkpoints: Number of checkpoints in `out`/checkpoints; older ones are removed. 0
+                keeps all.
             preview_every: Iterations between `Previewed` events; 0 for none.
             log_every: Iterations between `Stepped` events, at least 1.
             max_memory: GiB that the process may reach before growth stops, resident or reserved on
@@ -181,6 +184,7 @@ class Settings(TypedDict, total=False):
     device: Device
     rasterizer: Raster
     save_every: int
+    keep_checkpoints: int
     preview_every: int
     log_every: int
     max_memory: float

@@ -4,9 +4,14 @@ the string below it."""
 from __future__ import annotations
 
 import ast
+import dataclasses
 import functools
 import inspect
 import itertools
+import textwrap
+
+FIELDS = "\n\nFields:\n"
+"""Before what `explain` adds."""
 
 
 def of_field(kind: type, name: str) -> str:
@@ -16,8 +21,20 @@ def of_field(kind: type, name: str) -> str:
 
 def of_class(kind: type) -> str:
     """Return the docstring of a dataclass, or an empty string if `dataclass` generated it."""
-    text = inspect.cleandoc(kind.__doc__ or "")
+    text = inspect.cleandoc(kind.__doc__ or "").partition(FIELDS)[0]
     return "" if text.startswith(f"{kind.__name__}(") else text
+
+
+def explain(kind: object) -> None:
+    """Add the docstrings of its fields to that of a dataclass, for `help`."""
+    if not isinstance(kind, type) or not dataclasses.is_dataclass(kind):
+        return
+    texts = {field.name: of_field(kind, field.name) for field in dataclasses.fields(kind)}
+    lines = [
+        textwrap.fill(f"{name}: {text}", 88, initial_indent="    ", subsequent_indent="        ") for name, text in texts.items() if text
+    ]
+    if lines:
+        kind.__doc__ = of_class(kind) + FIELDS + "\n".join(lines)
 
 
 def title(kind: type) -> str:

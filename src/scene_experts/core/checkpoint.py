@@ -53,7 +53,7 @@ def save(folder: Path, step: int, tensors: dict[str, Tensor], meta: dict[str, An
         tensors: Tensors of any dtype that safetensors supports (float64 to bfloat16, integers,
             bool), on any device. They may share memory.
         meta: Plain JSON values without NaN.
-        keep: Number of checkpoints to keep, at least 1.
+        keep: Number of checkpoints to keep; 0: all.
 
     Returns:
         The path of the checkpoint.
@@ -67,7 +67,7 @@ def save(folder: Path, step: int, tensors: dict[str, Tensor], meta: dict[str, An
     path = folder / f"ckpt_{step:06d}.safetensors"
     write_tensors(path, tensors, KIND, FORMAT, meta)
     older = [file for number, file in _numbered(folder) if number < step]  # newest first
-    for file in older[max(keep, 1) - 1 :]:
+    for file in older[keep - 1 :] if keep else ():
         file.unlink(missing_ok=True)
     return path
 

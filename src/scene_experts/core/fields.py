@@ -1,6 +1,6 @@
 """What a field of a dataclass says about its setting beside its type and default, as annotations:
 which numbers it may have (`Range`), whether it grows with the training (`SCALES`), and where it has
-an effect (`Needs`).
+an effect (`Needs`, `With`).
 
     warmup: Annotated[int, Range(0), SCALES] = 1500
 
@@ -81,6 +81,19 @@ class Needs:
     (`SceneConfig.has`)."""
 
     what: str
+
+
+@dataclass(frozen=True)
+class With:
+    """Marks a setting that has an effect only where one of the settings `names` beside it is not
+    `off`."""
+
+    names: tuple[str, ...]
+    off: float = 0
+
+    def acts_in(self, part: Any) -> bool:
+        """Whether the setting has an effect in `part`, which it is a field of."""
+        return any(getattr(part, name) != self.off for name in self.names)
 
 
 @dataclass(frozen=True)
@@ -173,16 +186,19 @@ def scale(value: T, factor: float) -> T:
     return replace(value, **changes) if changes else value  # type: ignore[type-var]
 
 
-def changed_without(value: Any, has: frozenset[str], place: str = "") -> Iterator[str]:
-    """Yield the dotted paths of settings that need what is not in `has` and that do not have the
-    default of their dataclass."""
+def changed_without(value: Any, has: frozenset[str], usual: Any = None, place: str = "") -> Iterator[str]:
+    """Yield the dotted paths of settings that need what is not in `has`, or act only with others that
+    are off, and that have neither the default of their dataclass nor the value in `usual`: the same
+    settings of a recipe, or None."""
+    usual = usual if type(usual) is type(value) else None
     for field in dataclasses.fields(value):
         inner, here = getattr(value, field.name), f"{place}.{field.name}".lstrip(".")
-        need = note(type(value), field.name, Needs)
-        if need is not None and need.what not in has and inner != default_of(field):
+        need, beside = note(type(value), field.name, Needs), note(type(value), field.name, With)
+        idle = (need is not None and need.what not in has) or (beside is not None and not beside.acts_in(value))
+        if idle and inner != default_of(field) and (usual is None or inner != getattr(usual, field.name)):
             yield here
-        elif dataclasses.is_dataclass(inner):
-            yield from changed_without(inner, has, here)
+        elif dataclasses.is_dataclass(inner) and not idle:
+            yield from changed_without(inner, has, getattr(usual, field.name, None), here)
 
 
 def marked(value: Any, mark: type, place: str = "") -> Iterator[str]:

@@ -30,6 +30,14 @@ VARIANTS = {
     "lpips_3dgs": "LPIPS v0.1, VGG16, pictures in [0, 1] as 3DGS, Scaffold-GS and their descendants publish it; for comparison with papers",
     "lpips_alex": "LPIPS v0.1, AlexNet, pictures in [-1, 1]",
 }
+OF_MASKED = {
+    "psnr": "of masked views: over the pixels that the mask counts",
+    **dict.fromkeys(
+        (name for name in VARIANTS if name != "psnr"),
+        "of masked views: both pictures show the photograph where the mask excludes, and the distance is divided by the share that counts",
+    ),
+}
+"""What the metrics are of views with a mask."""
 NETWORKS = {"lpips": "vgg", "lpips_3dgs": "vgg", "lpips_alex": "alex"}
 LEAST_MSE = 1e-10  # identical pictures score 100 dB instead of infinity, which JSON cannot represent
 

@@ -20,7 +20,7 @@ from scene_experts.core.types import Camera
 from scene_experts.data.views import same_poses
 from scene_experts.evaluate.alignment import ALIGNED
 from scene_experts.evaluate.experts import measure_scene_shares
-from scene_experts.evaluate.metrics import VARIANTS, Perceptual
+from scene_experts.evaluate.metrics import OF_MASKED, VARIANTS, Perceptual
 from scene_experts.evaluate.options import EvalOptions
 from scene_experts.training import run_folder
 
@@ -75,14 +75,15 @@ def describe_scores(per_view: dict[str, dict[str, Any]], perceptual: Perceptual)
     scored = {name: facts for name, facts in per_view.items() if "psnr" in facts}
     if not scored:
         raise InputError("expected masks that leave pixels to score, found none; check the capture's masks")
+    masked = any(facts["masked"] for facts in scored.values())
     absent = dict(perceptual.absent)
     means = {metric: None if metric in absent else mean_over_views(scored, metric) for metric in VARIANTS}
     ours, theirs = mean_over_views(scored, "sharpness") or 0.0, mean_over_views(scored, "sharpness_photo") or 0.0
     return {
         **means,
         "absent": absent,
-        "variants": VARIANTS,
-        "masked": any(facts["masked"] for facts in scored.values()),
+        "variants": {metric: f"{about}; {OF_MASKED[metric]}" for metric, about in VARIANTS.items()} if masked else VARIANTS,
+        "masked": masked,
         "psnr_aligned": mean_over_views(scored, "psnr_aligned"),
         "detail": mean_over_views(scored, "detail"),
         "sharpness": {"render": ours, "photo": theirs, "ratio": ours / theirs if theirs > 0 else None},

@@ -5,18 +5,23 @@ from __future__ import annotations
 
 import functools
 import shlex
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Annotated
 
 from scene_experts.arguments.option import Option
 from scene_experts.arguments.parse import Command, HelpAsked, parse
 from scene_experts.core.errors import InputError, nearest
+from scene_experts.core.fields import flag_of
 from scene_experts.data.fetch.catalog import Numbers
+from scene_experts.data.settings import Data
 from scene_experts.training.config import Train, with_numbers
+from scene_experts.training.options import TrainOptions
 from scene_experts.training.recipes import RECIPES
 
 SET_HERE = ("--iterations", "--seed")
 """Flags that `reproduce` sets itself."""
+OF_ALL_ROWS = frozenset(flag_of(f.name) for kind in (Data, TrainOptions) for f in fields(kind))
+"""Other flags of `train` that no recipe has."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +66,13 @@ def read_line(line: str, numbers: Numbers = ()) -> Train:
         return cfg
     if mine := next((word for word in given if word.partition("=")[0] in SET_HERE), None):
         raise InputError(f"expected flags of the recipe in --recipes, found {mine} in {line!r}; give it to `reproduce` instead")
+    if other := next((word for word in given if word.partition("=")[0] in OF_ALL_ROWS), None):
+        raise InputError(
+            f"expected flags of the recipe in --recipes, found {other} in {line!r}, an option of the capture or of the run, which all rows "
+            "share; leave it out, or train such runs with `scene-experts train` and set them beside each other with `scene-experts compare`"
+        )
     try:
-        return replace(parse(_Holder, Command(f"{words[0]} in --recipes", defaults={"cfg": cfg}), given).cfg, recipe=line)
+        return replace(parse(_Holder, Command(f"scene-experts train {words[0]}", defaults={"cfg": cfg}), given).cfg, recipe=line)
     except HelpAsked:
         raise InputError(
             f"expected flags of the recipe in --recipes, found {line!r}; `scene-experts train {words[0]} --help-all` lists them"

@@ -27,6 +27,7 @@ Cull = Callable[[Tensor, Tensor, Camera], Tensor]
 """The rasteriser's visibility test: means [n, 3], scales [n, 3], camera -> [n] bool."""
 OPACITY = "an opacity network"
 ROUTERS = "routers that losses train"
+CODES = "appearance codes"
 EXPERTS = "several experts"
 EXPLICIT = "explicit Gaussians"
 Draws = Callable[[Camera, int, Mode, Cull], Decoded]
@@ -270,8 +271,8 @@ class SceneConfig(Part, ABC):
 
     @property
     def has(self) -> frozenset[str]:
-        """What the scene has of OPACITY, ROUTERS, EXPERTS and EXPLICIT. Settings that need another have no
-        effect; a training warns about them."""
+        """What the scene has of OPACITY, ROUTERS, EXPERTS, CODES and EXPLICIT. Settings that need another
+        have no effect; a training warns about them."""
         return frozenset()
 
     def of_views(self, views: int) -> Self:

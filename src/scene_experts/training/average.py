@@ -14,11 +14,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
-from scene_experts.core.fields import Count, Share
+from scene_experts.core.fields import Count, Share, With
 from scene_experts.core.parts import Part, register
 from scene_experts.scene import Scene
 
@@ -31,7 +32,7 @@ class Average(Part):
     span: Share = 0.0
     """Share of the training that the average spans (0.05 to 0.2 are useful); 0 uses the last
     weights."""
-    interval: Count = 10
+    interval: Annotated[Count, With(("span",))] = 10
     """Iterations between two updates of the average."""
 
     def due(self, step: int) -> bool:

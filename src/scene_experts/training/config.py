@@ -10,7 +10,19 @@ from typing import Annotated, Any
 
 from scene_experts.arguments.option import Option
 from scene_experts.core.errors import InputError
-from scene_experts.core.fields import SCALES, Count, CountOrNone, NotNegative, Range, Share, changed_without, check_fields, flag_of, scale
+from scene_experts.core.fields import (
+    SCALES,
+    Count,
+    CountOrNone,
+    NotNegative,
+    Range,
+    Share,
+    With,
+    changed_without,
+    check_fields,
+    flag_of,
+    scale,
+)
 from scene_experts.core.parts import Part, find
 from scene_experts.data.settings import Data
 from scene_experts.scene import EXPLICIT, LearningRates, SceneConfig
@@ -52,7 +64,7 @@ class Train:
     batch: Count = 1
     """Training views per optimiser step. Iterations count views, so N iterations make N / batch
     steps. Several processes (torchrun) share the views of a batch."""
-    batch_rates: Share = 0.5
+    batch_rates: Annotated[Share, With(("batch",), off=1)] = 0.5
     """Learning rates are multiplied by batch to this power. 0.5 keeps the variance of what a view
     moves (Zhao et al. 2024), 1 keeps how far the views together move."""
     seed: Annotated[int, Range(0, LARGEST_SEED)] = 0
@@ -62,7 +74,7 @@ class Train:
     random_background: bool = False
     """Train over a random background colour in each iteration, so that everything the photographs
     show becomes opaque. Transparent photographs keep the colour that they are composited over."""
-    random_background_from: Annotated[int, Range(0), SCALES] = 0
+    random_background_from: Annotated[int, Range(0), SCALES, With(("random_background",))] = 0
     """Iteration after which the background is random; until then it is that of the capture.
     --iterations rescales it."""
     half_until: Annotated[int, Range(0), SCALES] = 0
@@ -165,10 +177,11 @@ def check(cfg: Train) -> None:
         raise InputError("expected an optimiser that can move some rows only for --sparse-adam, found another; leave the flag out")
 
 
-def find_unused(cfg: Train) -> list[str]:
-    """Return the flags of the settings that have no effect on the scene of `cfg` and do not have
-    the default of their part."""
-    places = list(changed_without(cfg, cfg.scene.has))
+def find_unused(cfg: Train, usual: Train | None = None) -> list[str]:
+    """Return the flags of the settings that have no effect on the scene of `cfg` and have neither the
+    default of their part nor the value in `usual`, the settings of the recipe. Both are those before
+    scaling."""
+    places = list(changed_without(cfg, cfg.scene.has, usual))
     if cfg.sparse_adam and cfg.loss.regularises and EXPLICIT in cfg.scene.has:
         places.append("sparse_adam")  # these losses move every row
     return [flag_of(place) for place in places]

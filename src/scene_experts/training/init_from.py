@@ -42,7 +42,10 @@ def start_from(cfg: Train, run: Path, capture: Capture, device: str, now: RunCon
     if found is None:
         raise InputError(f"expected a trained run for --init-from at {run}, found none; give the folder that `train --out` wrote")
     tensors, meta = found
-    checkpoint.expect(meta, recipe=cfg.recipe)
+    if (other := meta.get("recipe")) != cfg.recipe:
+        raise InputError(
+            f"expected --init-from a run of '{cfg.recipe}', found {run} of '{other}'; train '{other}', or leave --init-from out"
+        )
     before = read_config(run)
     _check(cfg, run, before, meta, capture, now)
     torch.manual_seed(cfg.seed)

@@ -24,7 +24,6 @@ class Job:
     device: str = "cpu"
     dtype: torch.dtype = torch.float32  # float64 is for tests of rounding errors with the reference rasteriser
     options: TrainOptions = TrainOptions(preview_every=0)
-    keep: int = 2  # number of checkpoints to keep
     begin: Callable[[Training], None] = lambda training: None  # called once, before the first event
     watch: Callable[[Training], None] = lambda training: None  # called between iterations and not timed; the viewer renders here
     shard: bool = False  # divide the rows of the table among the processes

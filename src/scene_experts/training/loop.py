@@ -97,7 +97,7 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
             exchange.complete()
             tensors = exchange.tensors()
             if writes:
-                yield Saved(step, save(training, folder, run.keep, tensors))
+                yield Saved(step, save(training, folder, run.options.keep_checkpoints, tensors))
             del tensors
             saved = step
         del done  # frees its memory before the next frame
@@ -107,7 +107,7 @@ def train(cfg: Train, run: Job, capture: Capture, rasterize: Rasterizer) -> Iter
         exchange.complete()
         tensors = exchange.tensors()
         if writes:
-            yield Saved(training.step, save(training, folder, run.keep, tensors))
+            yield Saved(training.step, save(training, folder, run.options.keep_checkpoints, tensors))
         del tensors
     if exchange.stopping and training.step < total:
         yield Stopped(training.step, run.stop[0])

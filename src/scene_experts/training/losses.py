@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from scene_experts.arguments.option import Option
-from scene_experts.core.fields import SCALES, Needs, NotNegative, Share
+from scene_experts.core.fields import SCALES, Needs, NotNegative, Share, With
 from scene_experts.core.parts import Part, register
 from scene_experts.core.types import Decoded, Render, Routing
 from scene_experts.native import terms as native_terms
@@ -66,7 +66,7 @@ class Weights(Part):
     """Weight of the opacity hinge (eq. 8)."""
     load: Annotated[NotNegative, Needs(ROUTERS)] = 0.0
     """Weight of the load balancing (eq. 6 and 7)."""
-    tau: float = 0.0
+    tau: Annotated[float, With(("opacity",))] = 0.0
     """Opacity below which the hinge acts."""
     mean_opacity: Annotated[NotNegative, Needs(EXPLICIT)] = 0.0
     """Weight of the mean opacity of all explicit Gaussians (3DGS-MCMC)."""
@@ -76,16 +76,16 @@ class Weights(Part):
     """Weight of the error of the drawn depth, for captures with depth maps. It falls to a tenth."""
     depth_until: Annotated[int, Option(hidden=True), SCALES] = 30_000
     """Iteration at which the weight of the depth has fallen to a tenth."""
-    opacity_from: Annotated[int, SCALES] = 0
+    opacity_from: Annotated[int, SCALES, With(("opacity",))] = 0
     """First iteration with the opacity hinge."""
-    opacity_until: Annotated[int | None, SCALES] = None
+    opacity_until: Annotated[int | None, SCALES, With(("opacity",))] = None
     """Last iteration with the opacity hinge; none means the last iteration of the training."""
     residual_quantile: Share = 1.0
     """Share of each picture's pixels that count in full, those with the smallest residuals; 1 means
     all. Below 1, things that move between the photographs count less."""
-    residual_weight: Share = 0.0
+    residual_weight: Annotated[Share, With(("residual_quantile",), off=1)] = 0.0
     """Weight of the pixels with larger residuals."""
-    residual_from: Annotated[int, SCALES] = 1500
+    residual_from: Annotated[int, SCALES, With(("residual_quantile",), off=1)] = 1500
     """First iteration in which pixels with large residuals count less."""
 
     def has_hinge(self, step: int | None) -> bool:

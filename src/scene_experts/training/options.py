@@ -30,7 +30,10 @@ class TrainOptions:
     rasterizer: Raster = "auto"
     """Rasteriser. auto: the fastest that works on the device."""
     save_every: Count = 5000
-    """Iterations between checkpoints."""
+    """Iterations between checkpoints, of which the newest `keep_checkpoints` are kept."""
+    keep_checkpoints: CountOrNone = 2
+    """Number of checkpoints in RUN/checkpoints; older ones are removed. 0 keeps all, for `eval
+    --step`."""
     preview_every: CountOrNone = 1000
     """Iterations between previews of a held-out view in RUN/previews; 0 means none."""
     log_every: Annotated[Count, Option(hidden=True)] = 10

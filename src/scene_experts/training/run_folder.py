@@ -330,5 +330,8 @@ def at_step(folder: Path, step: int) -> tuple[dict[str, Tensor], dict[str, Any]]
     path = folder / f"ckpt_{step:06d}.safetensors"
     if not path.is_file():
         kept = ", ".join(str(int(p.stem[5:])) for p in sorted(folder.glob("ckpt_*.safetensors")) if p.stem[5:].isdecimal()) or "none"
-        raise InputError(f"expected a checkpoint at step {step} in {folder}, found {kept}; give one of those, or leave --step out")
+        raise InputError(
+            f"expected a checkpoint at step {step} in {folder}, found {kept}; give one of those, or leave --step out "
+            "(train with --keep-checkpoints 0 to keep all that --save-every writes)"
+        )
     return checkpoint.load(path)

@@ -15,9 +15,11 @@ from scene_experts.data.dense import NoDenseStartError, start_densely
 from scene_experts.data.far import add_far_points
 from scene_experts.data.settings import Data
 from scene_experts.training.adjusted import adjust_to_tracks
-from scene_experts.training.config import Train, find_unused
+from scene_experts.training.config import RunConfig, Train, find_unused
+from scene_experts.training.early import is_shrunk
 from scene_experts.training.init_from import start_from
 from scene_experts.training.job import Job, last_iteration
+from scene_experts.training.recipes import RECIPES
 from scene_experts.training.state import Training, resume
 
 log: logging.Logger = logging.getLogger(__name__)
@@ -46,8 +48,11 @@ def begin(cfg: Train, run: Job, capture: Capture, folder: Path | None) -> Traini
             found = f"found {run.config.stop_at}; give a larger number or leave it out"
             raise InputError(f"expected --stop-at above {training.step}, where the run of --init-from ended, {found}")
     training = training or start(cfg, run.config.data, capture, run.device, run.dtype)
-    if unused := find_unused(cfg):
-        log.warning("these options have no effect with this recipe: %s; leave them out", ", ".join(unused))
+    usual = RECIPES[cfg.recipe][1] if cfg.recipe in RECIPES else None
+    if unused := find_unused(run.config.train, usual):
+        log.warning("these options have no effect with this recipe and its other options: %s; leave them out", ", ".join(unused))
+    if idle := find_idle(run.config, capture, usual):
+        log.warning("these options have no effect here: %s", "; ".join(idle))
     if cfg.rate > MUCH:
         log.warning("--rate %g makes bits count so much that little may be left of the scene; 0.0005 to 0.002 is usual", cfg.rate)
     training.capture_id, training.poses, training.chosen = capture.fingerprint(), capture.poses(), capture.chosen()
@@ -57,6 +62,20 @@ def begin(cfg: Train, run: Job, capture: Capture, folder: Path | None) -> Traini
         training.computed = "; ".join(part for part in (training.computed, about) if part)
     training.scene.set_training_cameras([capture.views[i].camera for i in capture.train])
     return training
+
+
+def find_idle(config: RunConfig, capture: Capture, usual: Train | None) -> list[str]:
+    """Return the flags that were given, differ from the recipe (`usual`) and have no effect on this
+    capture, with the reason."""
+    cfg, found = config.train, []
+    shown = [capture.views[i] for i in capture.train]
+    if cfg.loss.depth not in (0, usual and usual.loss.depth) and all(view.depth is None for view in shown):
+        found.append("--loss.depth (no training photograph has a depth map)")
+    if cfg.half_until not in (0, usual and usual.half_until) and not any(is_shrunk(view.camera) for view in shown):
+        found.append("--half-until (all photographs are smaller)")
+    if config.stop_at is not None and config.stop_at > cfg.iterations:
+        found.append(f"--stop-at ({cfg.iterations:,} iterations end before)")
+    return found
 
 
 def uses_depth(cfg: Train, capture: Capture) -> bool:

@@ -299,7 +299,8 @@ def check_same(cfg: Train, meta: dict[str, Any]) -> None:
 
 
 def save(training: Training, folder: Path, keep: int, tensors: dict[str, Tensor] | None = None) -> Path:
-    """Write a checkpoint atomically and return its path. The newest `keep` checkpoints are kept.
+    """Write a checkpoint atomically and return its path. The newest `keep` checkpoints are
+    kept; 0: all.
 
     tensors: The state as named tensors, if it is divided among several processes; None means
     `training.tensors()`.

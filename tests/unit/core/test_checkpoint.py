@@ -79,6 +79,9 @@ def test_the_newest_are_kept(tmp_path):
     assert checkpoint.load(checkpoint.latest(tmp_path))[1] == {"step": 1_000_000}
     checkpoint.save(tmp_path, 20, tensors(), {}, keep=1)
     assert [s for s, _ in checkpoint._numbered(tmp_path)] == [1_000_000, 20], "a file ahead of this step is not ours to remove"
+    for step in (30, 40, 50):
+        checkpoint.save(tmp_path, step, tensors(), {}, keep=0)
+    assert [s for s, _ in checkpoint._numbered(tmp_path)] == [1_000_000, 50, 40, 30, 20]
 
 
 def test_leftovers_of_a_killed_save_go(tmp_path):

@@ -6,7 +6,7 @@ import pytest
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_json
-from scene_experts.evaluate.metrics import Perceptual
+from scene_experts.evaluate.metrics import VARIANTS, Perceptual
 from scene_experts.evaluate.options import EvalOptions
 from scene_experts.evaluate.results import (
     check_protocol,
@@ -48,6 +48,9 @@ def test_means_are_over_the_views_that_have_a_score():
     found = describe_scores({"a": view, "b": {**view, "psnr": 30.0, "detail": None}, "hidden": {}}, Perceptual.off())
     assert found["psnr"] == 25.0 and found["sharpness"]["ratio"] == 0.5 and found["detail"] == 0.8 and not found["masked"]
     assert found["lpips"] is None and "--no-lpips" in found["absent"]["lpips"]
+    assert found["variants"] == VARIANTS
+    masked = describe_scores({"a": {**view, "masked": True}}, Perceptual.off())["variants"]
+    assert "over the pixels that the mask counts" in masked["psnr"] and all("of masked views" in about for about in masked.values())
     with pytest.raises(InputError, match="masks"):
         describe_scores({"hidden": {}}, Perceptual.off())
 

@@ -46,6 +46,10 @@ def test_an_equals_sign_of_a_flag_is_no_name():
         ("moe-gs --seed 1", "--seed"),
         ("moe-gs --iterations=5", "--iterations=5"),
         ("moe-gs --help", "--help-all"),
+        ("moe-gs --split none", "found --split .* which all rows share; leave it out"),
+        ("moe-gs --near=0.1", "found --near=0.1 "),
+        ("moe-gs --stop-at 10", "found --stop-at "),
+        ("moe-gs --scene.hidde 8", "expected an option of `scene-experts train moe-gs`"),
         ("moe-gs --scene.hidden '8", "quotes"),
     ],
 )

@@ -8,7 +8,7 @@ from scene_experts.core.schedule import Every, Rate
 from scene_experts.scene.gaussians import ExplicitRates
 from scene_experts.strategy.grow_octree import GrowOctree
 from scene_experts.strategy.split_clone import SplitClone
-from scene_experts.training.config import check, find_unused
+from scene_experts.training.config import check, find_unused, with_numbers
 from scene_experts.training.losses import Weights
 from scene_experts.training.recipes import RECIPES
 from support.messages import naming
@@ -80,6 +80,42 @@ def test_settings_without_an_effect_are_found_and_no_others(recipe, part, change
     for name, value in changes.items():
         changed = replace(cfg, **{"loss": used, part: replace(used if part == "loss" else cfg.rates, **{name: value})})
         assert find_unused(changed) == [f"--{part}.{name.replace('_', '-')}"]
+
+
+IDLE = {
+    "random_background_from": 10,
+    "batch_rates": 1.0,
+    "rates.anneal_from": 0.3,
+    "rates.appearance": Rate(1.0, 0.1),
+    "scene.few_views": 3,
+    "scene.few_fall": (1, 2),
+    "scene.dropout_full": 100,
+    "loss.residual_weight": 0.5,
+    "loss.residual_from": 100,
+    "loss.tau": 0.3,
+    "loss.opacity_from": 1000,
+    "loss.opacity_until": 2000,
+    "average.interval": 3,
+}
+ON = {
+    "random_background": True,
+    "batch": 2,
+    "rates.anneal": 0.5,
+    "scene.appearance": 4,
+    "scene.dropout": 0.1,
+    "loss.residual_quantile": 0.9,
+    "loss.opacity": 0.1,
+    "average.span": 0.1,
+}
+
+
+def test_settings_that_act_only_with_others_are_found_where_those_are_off():
+    cfg, flags = RECIPES["scaffold-gs"][1], [f"--{place.replace('_', '-')}" for place in IDLE]
+    assert sorted(find_unused(with_numbers(cfg, list(IDLE.items())))) == sorted(flags)
+    assert find_unused(with_numbers(cfg, [*IDLE.items(), *ON.items()])) == []
+    few = RECIPES["one-network"][1]
+    off = with_numbers(few, [("scene.dropout", 0.0), ("scene.view_jitter", 0.0)])
+    assert find_unused(off) and find_unused(off, few) == []  # nobody gave what the recipe has
 
 
 @pytest.mark.parametrize("name", list(RECIPES))

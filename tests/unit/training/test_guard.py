@@ -50,7 +50,7 @@ def test_one_nan_in_one_gradient_stops_the_training_before_it_is_saved(recipe, n
     monkeypatch.setattr(guard, "EVERY", 4)
     spoiled, saved = spoil(monkeypatch, native=native), []
     with pytest.raises(RunError) as found:
-        for event in events(config(recipe), folder, tmp_path, stop_at=40, save_every=5, keep=99):
+        for event in events(config(recipe), folder, tmp_path, stop_at=40, save_every=5, keep_checkpoints=0):
             saved += [event.step] if isinstance(event, Saved) else []
     assert saved == [5, 10] and "iteration 10 " in str(found.value)
     assert spoiled[0] in str(found.value) or not native  # noise can carry it to another parameter before the next scan

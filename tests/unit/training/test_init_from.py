@@ -51,6 +51,9 @@ def test_a_training_starts_from_exactly_the_scene_of_another(tmp_path):
         with pytest.raises(InputError, match="--iterations"):
             other = replace(cfg, iterations=iterations, batch=batch)
             start_from(other.scaled(), tmp_path / "run", capture, "cpu", RunConfig(other, Data(folder)))
+    other = RECIPES["scaffold-gs"][1]
+    with pytest.raises(InputError, match=r"expected --init-from a run of 'scaffold-gs', found .* of 'moe-gs'"):
+        start_from(other.scaled(), tmp_path / "run", capture, "cpu", RunConfig(other, Data(folder)))
     with pytest.raises(InputError, match="--init-from"):
         start_from(cfg.scaled(), tmp_path, capture, "cpu", RunConfig(cfg, Data(folder)))
 

@@ -122,3 +122,17 @@ def test_nothing_grows_far_away_and_a_resumed_training_knows_it(tmp_path):
     ended = resume(cfg.scaled(), tmp_path / "whole" / "checkpoints", "cpu").scene.positions
     outside = [int((~((xyz >= low) & (xyz <= high)).all(1)).sum()) for xyz in (began, ended)]
     assert 0 < outside[1] <= outside[0] and len(ended) > len(began)
+
+
+def test_options_without_an_effect_on_this_capture_are_told(tmp_path, caplog):
+    folder = make_capture(tmp_path / "box", views=9, size=(48, 32), points=300).folder
+    cfg = config("scaffold-gs")
+    list(events(cfg, folder, stop_at=1))
+    assert "no effect" not in caplog.text
+    list(events(replace(cfg, half_until=10, loss=replace(cfg.loss, depth=0.5), iterations=2), folder, stop_at=3))
+    told = [record.getMessage() for record in caplog.records if "no effect here" in record.getMessage()]
+    assert len(told) == 1 and all(f"{flag} (" in told[0] for flag in ("--loss.depth", "--half-until", "--stop-at"))
+    plain = config("one-network")  # its own numbers are not said to be idle
+    caplog.clear()
+    list(events(plain, folder, stop_at=1))
+    assert "no effect" not in caplog.text

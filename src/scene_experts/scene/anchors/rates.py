@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from scene_experts.core.fields import Needs, NotNegative, Range
+from scene_experts.core.fields import Needs, NotNegative, Range, With
 from scene_experts.core.parts import register
 from scene_experts.core.schedule import Rate
-from scene_experts.scene import ROUTERS, LearningRates
+from scene_experts.scene import CODES, ROUTERS, LearningRates
 from scene_experts.scene.anchors.mlp import ATTRIBUTES
 
 SHARED = ("mix", "appearance")  # beside the decoder networks, what all anchors share
@@ -35,7 +35,7 @@ class Rates(LearningRates):
     """Learning rate of the colour network."""
     mix: Rate = Rate(0.01, 0.00001)
     """Learning rate of the network of the feature bank."""
-    appearance: Rate = Rate(0.05, 0.0005)
+    appearance: Annotated[Rate, Needs(CODES)] = Rate(0.05, 0.0005)
     """Learning rate of the appearance codes."""
     router_scale: Annotated[NotNegative, Needs(ROUTERS)] = 1.0
     """Factor of a router's learning rate over that of its attribute."""
@@ -45,7 +45,7 @@ class Rates(LearningRates):
     anneal: Annotated[float, Range(above=0, high=1)] = 1.0
     """Final value of the learning rates that are constant otherwise (feature, log_scaling, cov),
     relative to their first; 1 leaves them constant."""
-    anneal_from: Annotated[float, Range(0, below=1)] = 2 / 3
+    anneal_from: Annotated[float, Range(0, below=1), With(("anneal",), off=1)] = 2 / 3
     """Share of the training after which these rates fall, log-linearly."""
 
     def at(self, group: str, step: int, total: int, extent: float) -> float:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal, Self
 
-from scene_experts.core.fields import SCALES, Count, CountOrNone, Flag, NotNegative, Range, Scales
+from scene_experts.core.fields import SCALES, Count, CountOrNone, Flag, NotNegative, Range, Scales, With
 from scene_experts.geometry.voxel import VoxelChoice
-from scene_experts.scene import OPACITY, SceneConfig
+from scene_experts.scene import CODES, OPACITY, SceneConfig
 from scene_experts.scene.anchors.features import FeatureMix, OwnFeature
 from scene_experts.scene.anchors.few_views import find_weight
 from scene_experts.scene.anchors.mlp import Attribute, Decoder, Plain
@@ -45,16 +45,16 @@ class AnchorSettings(SceneConfig):
     dropout: Annotated[float, Range(0, below=1)] = 0.0
     """Share of the anchors that a training view leaves out from iteration `dropout_full` on; it
     rises linearly from 0. Meant for few photographs (after DropGaussian, Park et al. 2025)."""
-    dropout_full: Annotated[int, Range(1), Scales(least=1)] = 30_000
+    dropout_full: Annotated[int, Range(1), Scales(least=1), With(("dropout",))] = 30_000
     """Iteration at which the share of dropped anchors is reached. --iterations rescales it."""
     view_jitter: NotNegative = 0.0
     """Training views are decoded as seen from a random position around their camera. Its root mean
     square distance from the camera, as a share of the distance to the nearest other training
     cameras; 0 means no displacement."""
-    few_views: CountOrNone = 0
+    few_views: Annotated[CountOrNone, With(("dropout", "view_jitter"))] = 0
     """Number of training views up to which dropout and view_jitter have their whole value. Both
     fall linearly to 0 at twice as many views; 0: the same values for any number of views."""
-    few_fall: Annotated[tuple[int, int], Range(0), SCALES] = (0, 0)
+    few_fall: Annotated[tuple[int, int], Range(0), SCALES, With(("dropout", "view_jitter"))] = (0, 0)
     """Iterations between which dropout and view_jitter fall linearly to nothing; 0 0: they stay.
     --iterations rescales them."""
     smoothing: NotNegative = 0.0
@@ -75,7 +75,7 @@ class AnchorSettings(SceneConfig):
 
     @property
     def has(self) -> frozenset[str]:
-        return self.decoder.has | {OPACITY}
+        return self.decoder.has | {OPACITY} | ({CODES} if self.appearance else set())
 
     def phases(self) -> dict[str, int]:
         return {"decoder.warmup": self.dense_until, **{f"select.{name}": last for name, last in self.select.phases().items()}}
