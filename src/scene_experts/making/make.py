@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import threading
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, fields
@@ -41,6 +42,7 @@ from scene_experts.training import run_folder
 from scene_experts.training.events import Event, Started, Stepped
 from scene_experts.training.recipes import PROPOSED
 
+MARKED = 1 << 16  # bytes at the beginning of a photograph whose checksum tells it from others
 CAPTURE, RUN, PAGE = "capture", "run", "scene.html"
 PLAIN = SourceOptions()
 SAVE_EVERY = 1000  # iterations that a killed training loses at most
@@ -159,12 +161,16 @@ def find_poses(source: Path, folder: Path, options: SourceOptions, say: Callable
                 f"expected photographs or a video with {asked[0][0]}, found the capture {source}, which has poses; leave it out"
             )
         return source
+    if source.is_dir() and source.resolve() == folder.resolve():
+        raise InputError(
+            f"expected a folder for the scene that is not that of the photographs, found {folder} for both; choose another --out"
+        )
     place, note, given = folder / CAPTURE, folder / SOURCE, describe_source(source, folder)
     if is_capture(place):
         made_of = read_json(note, "note of a scene") if note.is_file() else None
         made_of = made_of if isinstance(made_of, dict) else {}
         files = made_of.get("files")
-        if made_of.get("source") != given["source"] and not (files and files == given["files"]):
+        if made_of.get("source") != given["source"] and not (files and isinstance(files, dict) and not tell_changes(files, given["files"])):
             other = f"that of {made_of['source']}" if "source" in made_of else "one of an unknown source"
             raise InputError(f"expected the scene of {given['source']} in {folder}, found {other}; choose another --out")
         expect_same(place, options)
@@ -188,20 +194,27 @@ def find_poses(source: Path, folder: Path, options: SourceOptions, say: Callable
 
 
 def describe_source(source: Path, folder: Path) -> dict[str, Any]:
-    """What tells photographs from others: their place, and the bytes of each file outside of `folder`,
-    by name."""
+    """What tells photographs from others: their place, and of each file outside of `folder`, by name,
+    the number of its bytes and a checksum of the first."""
     files = [source] if source.is_file() else list_files(source, folder) if source.is_dir() else []
     kept = [path for path in files if path == source or path.suffix.lower() in (*EXTENSIONS, *HEIC)]
     names = {path: path.name if path == source else path.relative_to(source).as_posix() for path in kept}
-    return {"source": str(source.resolve()), "files": {names[path]: path.stat().st_size for path in sorted(kept)}}
+    return {"source": str(source.resolve()), "files": {names[path]: _mark(path) for path in sorted(kept)}}
 
 
-def tell_changes(before: dict[str, Any], now: dict[str, int]) -> str:
-    """Say how many files are new, gone and changed; "" for none."""
+def _mark(path: Path) -> list[int]:
+    with path.open("rb") as file:
+        return [path.stat().st_size, zlib.crc32(file.read(MARKED))]
+
+
+def tell_changes(before: dict[str, Any], now: dict[str, list[int]]) -> str:
+    """Say how many files are new, gone and changed; "" for none. Older notes have the numbers of bytes
+    alone."""
+    same = lambda name: before[name] in (now[name], now[name][0])  # noqa: E731
     counts = (
         (len(now.keys() - before.keys()), "new"),
         (len(before.keys() - now.keys()), "gone"),
-        (sum(before[name] != now[name] for name in before.keys() & now.keys()), "changed"),
+        (sum(not same(name) for name in before.keys() & now.keys()), "changed"),
     )
     found = [f"{many} {'photograph is' if many == 1 else 'photographs are'} {how}" for many, how in counts if many]
     return " and ".join(found)

@@ -84,6 +84,10 @@ def prepare(place: Path, folder: Path, budget: TimeBudget, scores: bool, say: Ca
     if (folder / "config.json").is_file():
         begun = run_folder.read_config(folder)
         capture = load_capture(place, split=begun.data.split, resolution=begun.data.resolution, seed=begun.train.seed)
+        if begun.data.path.is_dir() and not begun.data.path.samefile(place):
+            other = load_capture(begun.data.path, split=begun.data.split, resolution=begun.data.resolution, seed=begun.train.seed)
+            if other.loaded.fingerprint() != capture.loaded.fingerprint():
+                raise InputError(f"expected the scene of {place} in {folder.parent}, found one of {begun.data.path}; choose another --out")
         if bool(capture.test_cameras) is not scores:
             told = "some were" if capture.test_cameras else "none was"
             raise InputError(

@@ -18,6 +18,7 @@ from scene_experts.core.progress import Progress
 
 GRADING_WIDTH = 480  # px; frames are scaled to this width before their sharpness is measured
 JPEG_QUALITY = 95
+NOISE = 0.25  # grey levels, of 255: the mean change that coding makes of a repeated frame, at most
 STILL = 0.1  # share of the usual change from frame to frame below which a frame is a copy of the one before
 
 
@@ -65,6 +66,9 @@ def measure_motion(changes: Sequence[float]) -> list[float]:
     changes: Mean absolute differences of each frame from the one before; the first counts as usual.
     """
     usual = float(np.quantile(changes[1:], 0.75)) if len(changes) > 1 else 0.0
+    moved = [change for change in changes[1:] if change > NOISE]
+    if usual <= NOISE and moved:  # most frames repeat the one before: pictures of another rate, or of a slide show
+        usual = float(np.quantile(moved, 0.75))
     shares = [min(1.0, change / usual) if usual > 0 else 1.0 for change in changes[1:]]
     return [1.0, *(share if share >= STILL else 0.0 for share in shares)][: len(changes)]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,12 +17,15 @@ from scene_experts.core.types import Camera, Mode
 from scene_experts.data.capture import Capture
 from scene_experts.data.views import same_poses
 from scene_experts.evaluate.pictures import join_pictures, to_8bit
+from scene_experts.files.transform import read_transform
 from scene_experts.render import Rasterizer, as_trained
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.view import path_files, paths, video
 from scene_experts.view.film_options import FilmOptions
 from scene_experts.view.paint import Look, measure_depth, paint
 from scene_experts.view.paths import CameraPath
+
+log: logging.Logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -132,15 +136,28 @@ def make_path(options: FilmOptions, capture: Capture) -> CameraPath:
     """Return the camera path of the options. Raises InputError if it is unknown."""
     size = options.pixels()
     if path_files.is_path_file(options.path):
+        _warn_of_length(options)
         model = paths.median_camera([v.camera for v in capture.views], size)
-        return path_files.read_path(Path(options.path), capture.world, model, size, options.fps)
+        moved = None if options.transform is None else read_transform(options.transform, capture)
+        return path_files.read_path(Path(options.path), capture.world, model, size, options.fps, moved)
+    if options.transform is not None:
+        raise InputError(f"expected a path of nerfstudio with --transform, found --path {options.path}; leave --transform out")
     fps = options.fps or 24.0
     if options.path == "test":
+        _warn_of_length(options)
+        if not capture.test:
+            log.warning("no photograph is held out: --path test shows the training views")
         chosen = capture.test or capture.train
         views = [capture.views[i] for i in chosen]
         cameras, names = tuple(resize_camera(view.camera, size) for view in views), tuple(view.name for view in views)
         return CameraPath(cameras, options.fps or 2.0, names)
     return paths.make_path(options.path, capture, options.frames or max(1, round(options.seconds * fps)), size, fps)
+
+
+def _warn_of_length(options: FilmOptions) -> None:
+    given = [flag for flag, on in (("--frames", options.frames is not None), ("--seconds", options.seconds != FilmOptions().seconds)) if on]
+    if given:
+        log.warning("%s: no effect with --path %s, whose cameras are all drawn; leave it out", " and ".join(given), options.path)
 
 
 def resize_camera(camera: Camera, size: tuple[int, int] | None) -> Camera:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal
 
 from scene_experts.arguments.option import Option
@@ -20,6 +21,8 @@ class FilmOptions:
     """Camera path: orbit, spiral, views (through the captured poses), test (each held-out view),
     auto (the one of these that fits the cameras), or a JSON file of this package or of
     nerfstudio."""
+    transform: Annotated[Path | None, Option(value="FILE")] = None
+    """How nerfstudio's path came into its frame: its dataparser_transforms.json."""
     seconds: Annotated[float, Range(0.01)] = 8.0
     """Duration of orbit, spiral and views."""
     frames: Annotated[int | None, Range(1)] = None

@@ -3,6 +3,7 @@ nerfstudio's camera-path JSON."""
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -18,10 +19,13 @@ from scene_experts.core.reading.numbers import FARTHEST
 from scene_experts.core.reading.source import guarding
 from scene_experts.core.types import Camera
 from scene_experts.data.views import World
+from scene_experts.files.transform import Similarity
 from scene_experts.geometry.poses import interpolate_poses, make_pose, with_fov
 from scene_experts.view.paths import CameraPath
 
+log: logging.Logger = logging.getLogger(__name__)
 FORMAT = 1
+FRAME, CAPTURE = "frame", "capture"  # entry of a path in nerfstudio's form that we wrote: its poses are in the capture's own frame
 LARGEST, FASTEST = 16384, 1000  # px per side; frames per second
 MOST_FRAMES, LONGEST = 36_000, 1e6  # of a path: 20 minutes at 30 frames per second; seconds
 OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # nerfstudio: y up, looking along -z
@@ -80,11 +84,19 @@ def write_nerfstudio(path: Path, cameras: CameraPath, world: World) -> None:
         "smoothness_value": 0.0,
         "is_cycle": False,
         "crop": None,
+        FRAME: CAPTURE,
     }
     write_json(path, value)
 
 
-def read_path(path: Path, world: World, model: Camera, size: tuple[int, int] | None = None, fps: float | None = None) -> CameraPath:
+def read_path(
+    path: Path,
+    world: World,
+    model: Camera,
+    size: tuple[int, int] | None = None,
+    fps: float | None = None,
+    moved: Similarity | None = None,
+) -> CameraPath:
     """Read a camera path of either format and return it in the trained world. Poses between
     keyframes are interpolated.
 
@@ -93,14 +105,24 @@ def read_path(path: Path, world: World, model: Camera, size: tuple[int, int] | N
         model: Camera whose near plane the path takes.
         size: Width and height in px, instead of those in the file.
         fps: Frames per second, instead of those in the file.
+        moved: From the frame of nerfstudio's path to the capture's own. None: they are the same.
 
     Raises:
         InputError: if the file is damaged or of another format.
     """
     value = read_json(path, "camera path")
+    theirs = isinstance(value, dict) and "camera_path" in value and value.get(FRAME) != CAPTURE
+    if moved is not None and not theirs:
+        raise InputError(f"expected a path of nerfstudio with --transform, found one in the capture's frame in {path}; leave it out")
+    if theirs and moved is None:
+        log.warning(
+            "the poses in %s are taken as in the capture's own frame; nerfstudio's own are in the frame of its "
+            "dataparser_transforms.json: give that with --transform",
+            path,
+        )
     with guarding(path, JSON, "camera path"):
         if isinstance(value, dict) and "camera_path" in value:
-            return parse_nerfstudio(value, world, model, size, fps)
+            return parse_nerfstudio(value, world, model, size, fps, moved or Similarity(torch.eye(3).double(), torch.zeros(3).double()))
         if isinstance(value, dict) and value.get("format") == FORMAT:
             return parse_keyframes(value, world, model, size, fps)
     raise InputError(
@@ -137,8 +159,10 @@ def parse_keyframes(value: dict[str, Any], world: World, model: Camera, size: tu
     return CameraPath(tuple(out), rate)
 
 
-def parse_nerfstudio(value: dict[str, Any], world: World, model: Camera, size: tuple[int, int] | None, fps: float | None) -> CameraPath:
-    """Return the path in nerfstudio's JSON. Raises ValueError for values out of range and for
+def parse_nerfstudio(
+    value: dict[str, Any], world: World, model: Camera, size: tuple[int, int] | None, fps: float | None, moved: Similarity
+) -> CameraPath:
+    """Return the path in nerfstudio's JSON. moved: from its frame to the capture's own. Raises ValueError for values out of range and for
     cameras without perspective."""
     if value.get("camera_type", "perspective") != "perspective":
         raise ValueError(f"the camera_type {value['camera_type']}, but only perspective is supported")
@@ -147,7 +171,8 @@ def parse_nerfstudio(value: dict[str, Any], world: World, model: Camera, size: t
     check_count(len(value["camera_path"]))
     for entry in value["camera_path"]:
         pose = check_pose(torch.tensor(entry["camera_to_world"], dtype=torch.float64).reshape(4, 4) @ OPENGL)
-        to_cam = make_pose(world.from_input(pose[:3, 3]), pose[:3, :3])
+        place = moved.scale * (moved.rotation @ pose[:3, 3]) + moved.shift
+        to_cam = make_pose(world.from_input(place), moved.rotation @ pose[:3, :3])
         out.append(make_camera(model, to_cam, math.radians(float(entry["fov"])), width, height))
     if not out:
         raise ValueError("an empty camera_path")

@@ -140,7 +140,9 @@ def test_the_same_training_is_not_begun_anew(capture, tmp_path, trained, monkeyp
 
 def test_a_repeated_call_continues_the_training_and_keeps_the_page(capture, tmp_path, trained, monkeypatch):
     made = make(capture, tmp_path / "out", say=lambda _: None)
-    begun = SimpleNamespace(data=SimpleNamespace(split="none", resolution="auto"), train=replace(trained.made[0].recipe, iterations=500))
+    begun = SimpleNamespace(
+        data=SimpleNamespace(path=capture, split="none", resolution="auto"), train=replace(trained.made[0].recipe, iterations=500)
+    )
     (made.run / "config.json").touch()
     monkeypatch.setattr(plan.run_folder, "read_config", lambda folder: begun)
     made.page.write_text("mine")
@@ -204,6 +206,18 @@ def test_photographs_that_changed_since_are_told_and_a_copy_of_them_goes_on(tmp_
     (tmp_path / "moved" / "a.jpg").unlink()
     with pytest.raises(InputError, match=naming(tmp_path / "moved", photos)):
         call(tmp_path / "moved")
+    with pytest.raises(InputError, match=r"found .* for both; choose another --out"):
+        make(photos, photos, say=said.append)
+    assert not (photos / making.SOURCE).exists()
+
+
+def test_photographs_of_the_same_names_and_sizes_are_told_apart(tmp_path):
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "1.bmp").write_bytes(name.encode())
+    one, two = (making.describe_source(tmp_path / name, tmp_path / "out")["files"] for name in ("one", "two"))
+    assert making.tell_changes(one, two) == "1 photograph is changed" and making.tell_changes(one, dict(one)) == ""
+    assert making.tell_changes({"1.bmp": 3}, one) == "", "notes of earlier versions have the sizes alone"
 
 
 def test_a_call_that_can_use_nothing_leaves_no_folder_and_a_killed_one_goes_on(tmp_path, monkeypatch):
@@ -234,7 +248,7 @@ def test_what_counts_is_whether_photographs_are_held_out(tmp_path, capture, trai
     monkeypatch.setattr(plan, "load_capture", lambda place, split, **more: given(place, split="none", **more))
     run = make(capture, tmp_path / "out", say=lambda _: None).run
     (run / "config.json").touch()
-    begun = SimpleNamespace(data=SimpleNamespace(split="auto", resolution="auto"), train=trained.made[0].recipe)
+    begun = SimpleNamespace(data=SimpleNamespace(path=capture, split="auto", resolution="auto"), train=trained.made[0].recipe)
     monkeypatch.setattr(plan.run_folder, "read_config", lambda folder: begun)
     make(capture, tmp_path / "out", say=lambda _: None)
     assert trained.made[1].resume

@@ -1,6 +1,7 @@
 """The plan of a training: when another one pays, and what is said of one that has begun."""
 
 from dataclasses import replace
+from shutil import copytree
 from types import SimpleNamespace
 
 import pytest
@@ -10,10 +11,15 @@ from scene_experts.api.recipe import recipe
 from scene_experts.bench import advice
 from scene_experts.bench.advice import Advice
 from scene_experts.core import checkpoint
+from scene_experts.core.errors import InputError
+from scene_experts.data.settings import Data
 from scene_experts.making import plan
 from scene_experts.making.budget import MOST_OF_FEW, TimeBudget
 from scene_experts.making.plan import TrainingPlan, describe_begun
+from scene_experts.training import run_folder
+from scene_experts.training.config import RunConfig
 from scene_experts.training.course import Course
+from support.messages import naming
 from support.synthetic import make_capture
 
 
@@ -54,3 +60,15 @@ def test_scores_hold_photographs_out_where_the_files_hold_none_out(tmp_path):
     (folder / "train.txt").write_text("\n".join(path.name for path in sorted((folder / "images").iterdir())))
     made = plan.prepare(folder, tmp_path / "run", TimeBudget(60.0), True, lambda _: None)
     assert made.split == "mod8" and made.held == 2
+
+
+def test_a_run_of_another_capture_is_named_and_one_of_a_copy_goes_on(tmp_path):
+    one, other = (make_capture(tmp_path / name, views=views, size=(24, 16), points=60).folder for name, views in (("one", 6), ("other", 7)))
+    run = tmp_path / "out" / "run"
+    run_folder.prepare(run, RunConfig(recipe("one-network"), Data(one, split="none")), resume=False)
+    said = []
+    with pytest.raises(InputError, match=naming(other, one, "choose another --out")):
+        plan.prepare(other, run, None, False, said.append)
+    assert said == []
+    copytree(one, tmp_path / "copy")
+    assert all(plan.prepare(place, run, None, False, said.append).begun for place in (one, tmp_path / "copy"))

@@ -18,6 +18,8 @@ def test_copies_are_left_out_and_slow_parts_get_fewer_frames():
     motion = frames.measure_motion(changes)
     assert [i for i, share in enumerate(motion) if not share] == [2, 5, 6] and max(motion) == 1.0 == motion[0]
     assert frames.choose_sharpest([9.0] * 11, motion, 20) == [0, 1, 3, 4, 7, 8, 9, 10]
+    repeated = [0.0, *[8.0, 0.1, 0.0, 0.1, 0.05] * 20]  # 12 pictures a second, stored at 60
+    assert [i for i, share in enumerate(frames.measure_motion(repeated)) if share] == [0, *range(1, 101, 5)]
     slow = [1.0] * 20 + [0.25] * 40  # as much motion in the first 20 frames as in twice the other 40
     chosen = frames.choose_sharpest([1.0] * 60, slow, 9)
     assert len(chosen) == 9 and sum(i < 20 for i in chosen) == 6

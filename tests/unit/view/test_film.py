@@ -6,8 +6,11 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.view.film import check_out, resize_camera
+from scene_experts.view.film import check_out, make_path, resize_camera
+from scene_experts.view.film_options import FilmOptions
+from support.captures import load
 from support.scenes import CAMERA
+from support.synthetic import make_capture
 
 
 def test_a_camera_at_another_size():
@@ -31,3 +34,14 @@ def test_a_name_that_is_neither_a_video_nor_a_folder(tmp_path):
         check_out(fine)
     with pytest.raises(InputError, match=r"a\.gif"):
         check_out(tmp_path / "a.gif")
+
+
+def test_options_without_an_effect_on_a_path_are_told(tmp_path, caplog):
+    capture = load(make_capture(tmp_path, views=9, size=(48, 32), points=200).folder)
+    assert len(make_path(FilmOptions(path="test"), capture)) == len(capture.test) and not caplog.text
+    none = replace(capture, test=(), train=tuple(range(9)))
+    assert len(make_path(FilmOptions(path="test", frames=3), none)) == 9
+    assert "--frames: no effect with --path test" in caplog.text and "shows the training views" in caplog.text
+    with pytest.raises(InputError, match="--transform"):
+        make_path(FilmOptions(path="orbit", transform=tmp_path), capture)
+    capture.images.close()

@@ -8,7 +8,9 @@ import torch
 
 from scene_experts.core.errors import InputError
 from scene_experts.data.views import World
+from scene_experts.files.transform import Similarity
 from scene_experts.geometry.poses import look_at, with_fov
+from scene_experts.geometry.rotation import quat_to_matrix
 from scene_experts.view import path_files
 from scene_experts.view.paths import CameraPath
 from support.messages import naming
@@ -47,6 +49,30 @@ def test_the_file_is_in_the_captures_frame_and_nerfstudios_axes_point_up_and_bac
     place = torch.tensor([0.0, 0.0, -3.0]) / 2.5 - torch.tensor([1.0, -2.0, 0.5])
     assert torch.allclose(ours[:3, 3], place, atol=1e-6) and torch.allclose(theirs[:3, 3], place, atol=1e-6)
     assert torch.allclose(theirs[:3, 2], -ours[:3, 2]) and torch.allclose(theirs[:3, 1], -ours[:3, 1])
+
+
+def test_a_path_of_nerfstudios_own_frame_comes_back_by_its_transform(tmp_path, caplog):
+    made = path(2)
+    path_files.write_nerfstudio(tmp_path / "p.json", made, WORLD)
+    path_files.read_path(tmp_path / "p.json", WORLD, CAMERA)
+    assert not caplog.text  # we wrote it
+    turn = quat_to_matrix(torch.tensor([[0.8, 0.0, 0.6, 0.0]], dtype=torch.float64))[0]
+    theirs = Similarity(turn, torch.tensor([0.3, 0.1, -0.2], dtype=torch.float64), 0.4)
+    value = json.loads((tmp_path / "p.json").read_text())
+    del value["frame"]
+    for entry in value["camera_path"]:
+        pose = torch.tensor(entry["camera_to_world"], dtype=torch.float64).reshape(4, 4)
+        pose[:3, 3] = theirs.scale * theirs.rotation @ pose[:3, 3] + theirs.shift
+        pose[:3, :3] = theirs.rotation @ pose[:3, :3]
+        entry["camera_to_world"] = pose.flatten().tolist()
+    (tmp_path / "p.json").write_text(json.dumps(value))
+    back = path_files.read_path(tmp_path / "p.json", WORLD, CAMERA, moved=theirs.inverse)
+    assert all(torch.allclose(a.world_to_cam, b.world_to_cam, atol=1e-5) for a, b in zip(made.cameras, back.cameras)) and not caplog.text
+    path_files.read_path(tmp_path / "p.json", WORLD, CAMERA)
+    assert "--transform" in caplog.text
+    path_files.write_path(tmp_path / "ours.json", made, WORLD)
+    with pytest.raises(InputError, match="--transform"):
+        path_files.read_path(tmp_path / "ours.json", WORLD, CAMERA, moved=theirs)
 
 
 def test_between_keyframes_the_camera_moves_and_size_and_speed_can_be_others(tmp_path):

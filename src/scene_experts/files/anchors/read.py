@@ -181,7 +181,8 @@ def _read_folder(folder: Path) -> AnchorData:
         networks = torchscript.read(folder)
     check_networks(networks, str(folder))
     about, settings = result_folder.read_description(folder), result_folder.read_settings(folder)
-    add_dist = distance_inputs(networks, columns, about is None and settings.get("add_level") is True, str(folder))
+    by_level = False if about is not None else settings.get("add_level") is True if settings else None
+    add_dist = distance_inputs(networks, columns, by_level, str(folder))
     step = (about or {}).get("step") or result_folder.iteration_of(folder) or 0
     flat = by_file_name(networks)
     if "level" in columns:  # its own columns state the lattices
@@ -235,11 +236,11 @@ def read_anchors(path: Path) -> dict[str, Tensor]:
     return out
 
 
-def distance_inputs(networks: dict[str, Network], columns: dict[str, Tensor], by_level: bool, where: str) -> tuple[Attribute, ...]:
+def distance_inputs(networks: dict[str, Network], columns: dict[str, Tensor], by_level: bool | None, where: str) -> tuple[Attribute, ...]:
     """The attributes whose network sees the distance: it has one input more than feature, direction
     and appearance code.
 
-    by_level: the networks also see the level (Octree-GS's add_level). Raises InputError for such
+    by_level: the networks also see the level (Octree-GS's add_level); None: nothing says so. Raises InputError for such
     networks, which cannot be drawn here, and for widths that do not fit the anchors.
     """
     K, F = columns["offsets"].shape[1], columns["feature"].shape[1]
@@ -254,6 +255,11 @@ def distance_inputs(networks: dict[str, Network], columns: dict[str, Tensor], by
                 f"expected {attribute} networks of {F + 3} inputs (1 more with the distance) and {CHANNELS[attribute] * K} outputs "
                 f"in {where}, found {w1.shape[2]} and {w2.shape[1]}; use the files of one training"
             )
+    if by_level is None and "level" in columns and max(spare.values()) == 1:
+        raise InputError(
+            f"expected cfg_args beside the point_cloud folder of {where}, which says whether the networks see the distance or the level, "
+            "found none; copy it there"
+        )
     if by_level or max(spare.values()) > 1:
         raise InputError(
             f"expected networks that see feature, direction and distance in {where}, found networks that see the level too; train it here"

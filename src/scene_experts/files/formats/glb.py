@@ -26,7 +26,7 @@ from scene_experts.core.reading.plain import JSON_STARTS
 from scene_experts.core.reading.source import Source, opening
 from scene_experts.files.formats.gltf import BIN, JSON, MAGIC, GltfFile
 from scene_experts.files.formats.pack import Floats, alphas, logits, tensor, to_bytes, turn, unit_quats, warn_of_transforms
-from scene_experts.files.formats.splats import Splats
+from scene_experts.files.formats.splats import Splats, tell_degree
 from scene_experts.files.formats.spz import decode
 from scene_experts.files.registry import Format
 from scene_experts.geometry.sh import C0
@@ -191,6 +191,7 @@ def _read_primitive(file: GltfFile, attributes: dict[str, int]) -> Splats:
     """The Gaussians of one primitive, in our frame."""
     get = lambda name: file.accessor(attributes[name])  # noqa: E731
     degree = max((int(m[1]) for name in attributes if (m := re.fullmatch(NAME + r":SH_DEGREE_(\d)_COEF_0", name))), default=0)
+    tell_degree(degree)
     names = [f"{NAME}:SH_DEGREE_{d}_COEF_{i}" for d in range(min(degree, 3) + 1) for i in range(2 * d + 1)]
     small = (get("POSITION"), get(f"{NAME}:SCALE"), get(f"{NAME}:ROTATION"), get(f"{NAME}:OPACITY")[:, 0])
     sh = np.empty((len(small[0]), len(names), 3), np.float32)  # one after the other: most of the memory of a file is here

@@ -25,8 +25,15 @@ NAMES = ("means", "log_scales", "quats", "opacity_logit", "sh")
 
 _SURE = 20.0  # logit of an opacity of 1: 1 - 2e-9
 _SHORTEST = math.log(1e-30)
+MOST_DEGREE = 3
 BROKEN = 100  # a file with more than one Gaussian in so many that is not finite is damaged
 _NO_LENGTH = 1e-12  # of a quaternion; renderers divide by its length, or by this if that is less
+
+
+def tell_degree(degree: int) -> None:
+    """Warn of harmonics of a file that are not read."""
+    if degree > MOST_DEGREE:
+        log.warning("the file has harmonics up to degree %d: those above degree %d are left out", degree, MOST_DEGREE)
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ from scene_experts.files.formats.pack import (
     turn,
     unit_quats,
 )
-from scene_experts.files.formats.splats import Splats
+from scene_experts.files.formats.splats import Splats, tell_degree
 from scene_experts.files.registry import Format
 
 MAGIC, HEADER = 0x5053474E, struct.Struct("<IIIBBBB")
@@ -137,6 +137,7 @@ def decode(data: bytes, source: Source) -> Splats:
     if not np.isfinite(means).all():
         raise Damaged("positions that are not finite")
     quats = _unpack_quats(streams["rotations"], n) if version >= 3 else _unpack_xyz(streams["rotations"], n)
+    tell_degree(degree)
     count = (min(degree, 3) + 1) ** 2
     sh = np.empty((n, count, 3), np.float32)  # in place: most of the memory of a file is here
     sh[:, 0] = (streams["colors"].reshape(n, 3) / 255.0 - 0.5) / _COLOR

@@ -39,7 +39,7 @@ from scene_experts.files.formats.pack import (
     unit_quats,
     warn_of_transforms,
 )
-from scene_experts.files.formats.splats import Splats
+from scene_experts.files.formats.splats import Splats, tell_degree
 from scene_experts.files.formats.usd_worker import COEFFICIENTS, DAMAGED, MISSING
 from scene_experts.files.registry import Format
 
@@ -144,6 +144,7 @@ def _prim(source: Source, data: Any, number: int) -> tuple[Floats, ...]:
     degree = int(data[f"{number}:degree"])
     if not 0 <= degree <= 10:
         raise Damaged(f"harmonics of degree {degree}")
+    tell_degree(degree)
     n, coefficients = len(means), (degree + 1) ** 2
     check_count(source, n, decoded_bytes(degree))
     if (len(scales), len(xyzw), len(opacity), len(flat)) != (n, n, n, n * coefficients):

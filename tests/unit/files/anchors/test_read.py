@@ -16,7 +16,7 @@ from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
 from scene_experts.files.anchors import torchscript
 from scene_experts.files.anchors.data import by_attribute
-from scene_experts.files.anchors.read import check_networks, for_trained_unit, level_facts, read_folder
+from scene_experts.files.anchors.read import check_networks, distance_inputs, for_trained_unit, level_facts, read_folder
 from scene_experts.files.anchors.write import level_info
 from scene_experts.files.formats.ply import read_vertices, write_vertices
 from scene_experts.files.importing import import_files
@@ -351,3 +351,16 @@ def test_the_networks_of_a_router_of_another_form_are_read():
         del attribute["router_directions"]
     with pytest.raises(InputError, match="experts that fit together"):
         check_networks(networks, "there")
+
+
+def test_levels_without_settings_do_not_pass_for_distances():
+    K, F = 10, 32
+    networks = {
+        a: {"w1": torch.zeros(1, 32, F + 4), "w2": torch.zeros(1, n * K, 32)} for a, n in (("opacity", 1), ("cov", 7), ("color", 3))
+    }
+    columns = {"offsets": torch.zeros(5, K, 3), "feature": torch.zeros(5, F)}
+    assert distance_inputs(networks, columns, None, "x") == ("opacity", "cov", "color")  # Scaffold-GS has no levels
+    columns["level"] = torch.zeros(5)
+    assert distance_inputs(networks, columns, False, "x") == ("opacity", "cov", "color")
+    with pytest.raises(InputError, match="cfg_args"):
+        distance_inputs(networks, columns, None, "x")

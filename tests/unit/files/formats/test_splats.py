@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
-from scene_experts.files.formats.splats import Splats
+from scene_experts.files.formats.splats import Splats, tell_degree
 from support.messages import naming
 from support.splats import splats
 
@@ -91,3 +91,10 @@ def test_parts_are_joined_with_the_harmonics_that_all_have():
     found = Splats.joined([a, b])
     assert len(found) == 5 and found.degree == 1 and torch.equal(found.sh[:3], a.sh[:, :4]) and torch.equal(found.quats[3:], b.quats)
     assert Splats.joined([a]) is a
+
+
+def test_harmonics_above_the_third_degree_are_told(caplog):
+    tell_degree(3)
+    assert not caplog.text
+    tell_degree(4)
+    assert "degree 4" in caplog.text
