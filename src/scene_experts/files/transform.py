@@ -1,57 +1,29 @@
-"""Brings Gaussians of another frame into that of a capture: a rotation, a scale and a shift, as
-nerfstudio states them in dataparser_transforms.json."""
+"""Brings Gaussians of another frame into that of a capture."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from scene_experts.core.io import read_json
-from scene_experts.core.reading import budget
-from scene_experts.core.reading.budget import Damaged
-from scene_experts.core.reading.numbers import FARTHEST, number
-from scene_experts.core.reading.source import guarding
-from scene_experts.data.views import Capture
+from scene_experts.data.transform import Similarity
 from scene_experts.files.formats.splats import Splats
 from scene_experts.geometry import sh
 from scene_experts.geometry.rotation import matrix_to_quat, normalise_quats, quat_to_matrix
 
-_ORTHONORMAL = 1e-3
 
-
-@dataclass(frozen=True)
-class Similarity:
-    """Maps a point p [3] to scale * rotation p + shift, in float64."""
-
-    rotation: Tensor  # [3, 3]
-    shift: Tensor  # [3]
-    scale: float = 1.0
-
-    @property
-    def inverse(self) -> Similarity:
-        back = self.rotation.T
-        return Similarity(back, -(back @ self.shift) / self.scale, 1 / self.scale)
-
-    def then(self, other: Similarity) -> Similarity:
-        """Return this map followed by another."""
-        shift = other.scale * (other.rotation @ self.shift) + other.shift
-        return Similarity(other.rotation @ self.rotation, shift, other.scale * self.scale)
-
-    def applied(self, splats: Splats) -> Splats:
-        """Return the Gaussians at their new places; their positions are float64."""
-        turned = self.rotation @ quat_to_matrix(normalise_quats(splats.quats.double()))
-        return replace(
-            splats,
-            means=self.scale * splats.means.double() @ self.rotation.T + self.shift,
-            log_scales=splats.log_scales + math.log(self.scale),
-            quats=matrix_to_quat(turned).float(),
-            sh=rotate_harmonics(splats.sh, self.rotation),
-        )
+def move(splats: Splats, by: Similarity) -> Splats:
+    """Return the Gaussians at their new places; their positions are float64."""
+    turned = by.rotation @ quat_to_matrix(normalise_quats(splats.quats.double()))
+    return replace(
+        splats,
+        means=by.scale * splats.means.double() @ by.rotation.T + by.shift,
+        log_scales=splats.log_scales + math.log(by.scale),
+        quats=matrix_to_quat(turned).float(),
+        sh=rotate_harmonics(splats.sh, by.rotation),
+    )
 
 
 def rotate_harmonics(coefficients: Tensor, rotation: Tensor) -> Tensor:
@@ -62,43 +34,3 @@ def rotate_harmonics(coefficients: Tensor, rotation: Tensor) -> Tensor:
     before, after = sh.basis(directions, degree), sh.basis(directions @ rotation.T, degree)
     mix = torch.linalg.lstsq(after, before).solution  # after @ mix = before; each degree mixes within itself
     return torch.einsum("ij,njc->nic", mix, coefficients.double()).to(coefficients.dtype)
-
-
-def read_transform(path: Path, capture: Capture) -> Similarity:
-    """Return the map from the frame of a file to that of a capture.
-
-    path: JSON with `transform`, rows of a 3 x 4 matrix, and `scale`, as nerfstudio writes
-    dataparser_transforms.json: a point p of the reconstruction is at scale * (transform p) in the
-    file. The poses of a capture may have been turned and scaled first (`Capture.applied`).
-
-    Raises InputError for another file and for a matrix without a rotation.
-    """
-    found = read_json(path, "transform")
-    with guarding(path, budget.JSON, "transform"):
-        if not isinstance(found, dict) or "transform" not in found:
-            raise Damaged("no transform; nerfstudio's is dataparser_transforms.json")
-        scale = number(found.get("scale", 1.0), "the scale", 1e-15, FARTHEST)
-        turn = _matrix(found["transform"])
-    if capture.applied_scale is not None:  # the file's scale is from the unit of the reconstruction
-        with guarding(capture.root, budget.JSON, "capture"):
-            scale /= number(capture.applied_scale, "applied_scale", 1e-15, FARTHEST)
-    with guarding(path, budget.JSON, "transform"):
-        to_file = Similarity(turn.rotation, scale * turn.shift, scale)
-    if capture.applied is None:
-        return to_file.inverse
-    with guarding(capture.root, budget.JSON, "capture"):
-        return to_file.inverse.then(_matrix(capture.applied))
-
-
-def _matrix(rows: Any) -> Similarity:
-    """Return the rotation and shift in the rows of a 3 x 4 or 4 x 4 matrix."""
-    if not isinstance(rows, list) or len(rows) not in (3, 4) or not all(isinstance(row, list) and len(row) == 4 for row in rows):
-        raise Damaged("a matrix of another form than 3 x 4")
-    matrix = torch.tensor(
-        [[number(v, "an entry of the matrix", -FARTHEST, FARTHEST) for v in row] for row in rows[:3]], dtype=torch.float64
-    )
-    rotation = matrix[:, :3]
-    if not torch.allclose(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), atol=_ORTHONORMAL) or torch.linalg.det(rotation) < 0:
-        raise Damaged("a matrix that is no rotation")
-    u, _, vh = torch.linalg.svd(rotation)
-    return Similarity(u @ vh, matrix[:, 3])

@@ -22,6 +22,8 @@ from scene_experts.core.errors import InputError, RunError
 from scene_experts.core.fields import flag_of
 from scene_experts.core.io import read_json, write_json
 from scene_experts.core.progress import Progress
+from scene_experts.core.reading.budget import HEAD
+from scene_experts.core.reading.source import opening
 from scene_experts.core.signals import handled
 from scene_experts.data.capture import name_capture
 from scene_experts.data.match import EXTENSIONS
@@ -203,8 +205,8 @@ def describe_source(source: Path, folder: Path) -> dict[str, Any]:
 
 
 def _mark(path: Path) -> list[int]:
-    with path.open("rb") as file:
-        return [path.stat().st_size, zlib.crc32(file.read(MARKED))]
+    with opening(path, HEAD, "photograph") as source:
+        return [path.stat().st_size, zlib.crc32(source.head(MARKED))]
 
 
 def tell_changes(before: dict[str, Any], now: dict[str, list[int]]) -> str:

@@ -15,9 +15,9 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.progress import Progress
 from scene_experts.core.types import Camera, Mode
 from scene_experts.data.capture import Capture
+from scene_experts.data.transform import read_transform
 from scene_experts.data.views import same_poses
 from scene_experts.evaluate.pictures import join_pictures, to_8bit
-from scene_experts.files.transform import read_transform
 from scene_experts.render import Rasterizer, as_trained
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.view import path_files, paths, video

@@ -18,8 +18,8 @@ from scene_experts.core.reading.budget import JSON
 from scene_experts.core.reading.numbers import FARTHEST
 from scene_experts.core.reading.source import guarding
 from scene_experts.core.types import Camera
+from scene_experts.data.transform import Similarity
 from scene_experts.data.views import World
-from scene_experts.files.transform import Similarity
 from scene_experts.geometry.poses import interpolate_poses, make_pose, with_fov
 from scene_experts.view.paths import CameraPath
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from scene_experts.core.errors import InputError
+from scene_experts.data.transform import Similarity
 from scene_experts.data.views import World
-from scene_experts.files.transform import Similarity
 from scene_experts.geometry.poses import look_at, with_fov
 from scene_experts.geometry.rotation import quat_to_matrix
 from scene_experts.view import path_files

@@ -20,6 +20,7 @@ from scene_experts.core.reading.source import guarding
 from scene_experts.core.table import Table
 from scene_experts.data import capture as captures
 from scene_experts.data.settings import Data
+from scene_experts.data.transform import read_transform
 from scene_experts.data.views import Capture, Vector, World
 from scene_experts.files import result_folder
 from scene_experts.files.formats.ply import has_gaussians, property_names
@@ -29,7 +30,7 @@ from scene_experts.files.placed import place_cameras
 from scene_experts.files.registry import Imported, recognise, scene_file
 from scene_experts.files.registry import read as read_file
 from scene_experts.files.scene_folder import tell_origin
-from scene_experts.files.transform import read_transform
+from scene_experts.files.transform import move
 from scene_experts.scene import Scene
 from scene_experts.scene.gaussians import Explicit, GaussianScene
 from scene_experts.training.config import Train
@@ -76,7 +77,7 @@ def read(source: Path, data: Data | None, iteration: int | None, transform: Path
         splats, origin = read_splats(source), (0.0, 0.0, 0.0)
         placed = capture.world if transform is not None else file_world(source, splats, capture)
     if transform is not None:
-        columns = table_columns(read_transform(transform, capture).applied(splats), capture.world)
+        columns = table_columns(move(splats, read_transform(transform, capture)), capture.world)
     else:
         columns = table_columns(splats, placed)
     step = about.get("step") or iteration or result_folder.iteration_of(source.parent) or 0
