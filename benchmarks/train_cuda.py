@@ -147,9 +147,8 @@ def train_recipe(
         for _ in training.train(short, Job(replace(config, train=short), device=args.device), capture, rasterize):
             pass
         torch.cuda.reset_peak_memory_stats()
-    run = Job(
-        config, args.out / name, args.device, options=TrainOptions(resume=True, save_every=10**9, preview_every=0, log_every=100), keep=1
-    )
+    options = TrainOptions(resume=True, save_every=10**9, keep_checkpoints=1, preview_every=0, log_every=100)
+    run = Job(config, args.out / name, args.device, options=options)
     finished = False
     for event in training.train(cfg, run, capture, rasterize):
         if isinstance(event, Stepped):
