@@ -30,15 +30,16 @@ def browser():
         made.close()
 
 
-def settled(page, viewer, seconds=30.0) -> np.ndarray:
-    """A screenshot once the client has its full picture."""
+def settled(page, viewer, seconds=120.0) -> np.ndarray:
+    """A screenshot once the client has its full picture, and the page, on a busy machine too, shows it."""
     end = time.monotonic() + seconds
     while time.monotonic() < end and not (viewer.clients and all(c.full for c in viewer.clients.values())):
         page.wait_for_timeout(200)
     take = lambda: np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))  # noqa: E731
     page.wait_for_timeout(2500)
     before, shot = None, take()
-    while time.monotonic() < end and (before is None or not np.array_equal(before, shot)):  # the page fades pictures in
+    done = lambda: before is not None and np.array_equal(before, shot) and shot[PART].std() > 1  # noqa: E731
+    while time.monotonic() < end and not done():  # the page fades pictures in
         page.wait_for_timeout(1500)
         before, shot = shot, take()
     return shot
