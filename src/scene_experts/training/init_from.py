@@ -31,8 +31,9 @@ def start_from(cfg: Train, run: Path, capture: Capture, device: str, now: RunCon
     folder, at its iteration.
 
     The scene has its averaged weights, if there are any. The optimiser, the statistics and the
-    order of the views start anew; rows are created where that run created them. now: The configuration of the new run, with the settings
-    before scaling.
+    order of the views start anew; rows are created where that run created them.
+
+    now: The configuration of the new run, with the settings before scaling.
 
     Raises InputError if the run has no checkpoint, another recipe, capture, world or scene, or
     as many iterations as `cfg` already, or if `cfg` would put its scene back into a phase that

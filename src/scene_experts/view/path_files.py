@@ -162,8 +162,10 @@ def parse_keyframes(value: dict[str, Any], world: World, model: Camera, size: tu
 def parse_nerfstudio(
     value: dict[str, Any], world: World, model: Camera, size: tuple[int, int] | None, fps: float | None, moved: Similarity
 ) -> CameraPath:
-    """Return the path in nerfstudio's JSON. moved: from its frame to the capture's own. Raises ValueError for values out of range and for
-    cameras without perspective."""
+    """Return the path in nerfstudio's JSON. moved: from its frame to the capture's own.
+
+    Raises ValueError for values out of range and for cameras without perspective.
+    """
     if value.get("camera_type", "perspective") != "perspective":
         raise ValueError(f"the camera_type {value['camera_type']}, but only perspective is supported")
     width, height = size or check_size(value["render_width"], value["render_height"])

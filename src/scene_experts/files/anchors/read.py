@@ -240,8 +240,9 @@ def distance_inputs(networks: dict[str, Network], columns: dict[str, Tensor], by
     """The attributes whose network sees the distance: it has one input more than feature, direction
     and appearance code.
 
-    by_level: the networks also see the level (Octree-GS's add_level); None: nothing says so. Raises InputError for such
-    networks, which cannot be drawn here, and for widths that do not fit the anchors.
+    by_level: the networks also see the level (Octree-GS's add_level); None: nothing says whether.
+    Raises InputError for such networks, which cannot be drawn here, where it is not known of anchors
+    with levels, and for widths that do not fit the anchors.
     """
     K, F = columns["offsets"].shape[1], columns["feature"].shape[1]
     codes = networks["appearance"]["table"].shape[1] if "appearance" in networks else 0
