@@ -29,25 +29,33 @@ F32x16 sum_gradients(const State& s, uint32_t place, int rows) {
 struct ProjectionGradient {  // one Gaussian per lane
   F32x16 mean[3], quat[4], scale[3], mean2d[2];
 
-  // d loss / d 2D covariance: 1/2 C^-1 S C^-1, where S holds the second moments of W, plus the part of the
-  // antialias factor.
-  static void differentiate_covariance(const Projection& p, const F32x16 (&sum)[16], bool antialias, F32x16& gxx, F32x16& gxy,
-                                       F32x16& gyy) {
-    const F32x16 inv = broadcast(1.0f) / p.det, half = broadcast(0.5f), zero = broadcast(0.0f);
-    const F32x16 a = p.cyy * inv, b = zero - p.xy * inv, c = p.cxx * inv;
-    const F32x16 r0 = fma(a, sum[kSxx], b * sum[kSxy]), r1 = fma(a, sum[kSxy], b * sum[kSyy]);
-    const F32x16 q0 = fma(b, sum[kSxx], c * sum[kSxy]), q1 = fma(b, sum[kSxy], c * sum[kSyy]);
-    gxx = half * fma(r0, a, r1 * b);
-    gxy = half * fma(r0, b, r1 * c);
-    gyy = half * fma(q0, b, q1 * c);
+  // adj(C0) u, where C0 is the 2D covariance without blur: the sum over the axes of p (p . u), where p is an axis
+  // turned by a right angle. yy u0 - xy u1 would lose the digits of long thin Gaussians.
+  static void apply_adjugate(const Projection& p, F32x16 u0, F32x16 u1, F32x16& out0, F32x16& out1) {
+    out0 = out1 = broadcast(0.0f);
+    for (int k = 0; k < 3; ++k) {
+      const F32x16 across = p.b[1][k] * u0 - p.b[0][k] * u1;  // exactly 0 where u is this axis
+      out0 = fma(p.b[1][k], across, out0), out1 = fnma(p.b[0][k], across, out1);
+    }
+  }
+
+  // C^-1 u, where C is the 2D covariance with blur.
+  static void apply_inverse(const Projection& p, F32x16 u0, F32x16 u1, F32x16 inv, F32x16& out0, F32x16& out1) {
+    apply_adjugate(p, u0, u1, out0, out1);
+    out0 = fma(broadcast(kBlur), u0, out0) * inv, out1 = fma(broadcast(kBlur), u1, out1) * inv;
+  }
+
+  // d loss / d axis j of the ellipse: C^-1 S C^-1 b, where S holds the second moments of W, plus the part of the
+  // antialias factor, 1/2 (ln sharp - ln det) = ln compensation.
+  static void differentiate_axis(const Projection& p, const F32x16 (&sum)[16], F32x16 inv, bool antialias, int j, F32x16& d0, F32x16& d1) {
+    F32x16 n0, n1;
+    apply_adjugate(p, p.b[0][j], p.b[1][j], n0, n1);
+    const F32x16 v0 = fma(broadcast(kBlur), p.b[0][j], n0) * inv, v1 = fma(broadcast(kBlur), p.b[1][j], n1) * inv;
+    apply_inverse(p, fma(sum[kSxx], v0, sum[kSxy] * v1), fma(sum[kSxy], v0, sum[kSyy] * v1), inv, d0, d1);
     if (!antialias) return;
-    // ln compensation = 1/2 (ln sharp - ln det); the derivative of the logarithm of a determinant is the inverse
-    // matrix.
     const Mask16 smooth = gt(p.sharp, p.det * broadcast(kMinCompensation2));
-    const F32x16 g = keep(smooth, half * sum[kS]), one_sharp = broadcast(1.0f) / select(smooth, p.sharp, broadcast(1.0f));
-    gxx = fma(g, fma(p.yy, one_sharp, zero - a), gxx);
-    gxy = fma(g, fnma(p.xy, one_sharp, zero - b), gxy);
-    gyy = fma(g, fma(p.xx, one_sharp, zero - c), gyy);
+    const F32x16 g = keep(smooth, sum[kS]), one_sharp = broadcast(1.0f) / select(smooth, p.sharp, broadcast(1.0f));
+    d0 = fma(g, fma(n0, one_sharp, broadcast(0.0f) - v0), d0), d1 = fma(g, fma(n1, one_sharp, broadcast(0.0f) - v1), d1);
   }
 
   static void differentiate_quaternion(const F32x16 (&q)[4], const F32x16 (&d)[3][3], F32x16 (&out)[4]) {
@@ -62,15 +70,15 @@ struct ProjectionGradient {  // one Gaussian per lane
 
   ProjectionGradient(const State& s, const Projection& p, const F32x16 (&q)[4], const F32x16 (&size)[3], const F32x16 (&sum)[16]) {
     const SeCamera& cam = s.camera;
-    const F32x16 two = broadcast(2.0f), zero = broadcast(0.0f), inv = broadcast(1.0f) / p.det;
-    const F32x16 gu = (p.xy * sum[kSy] - p.cyy * sum[kSx]) * inv, gv = (p.xy * sum[kSx] - p.cxx * sum[kSy]) * inv;
+    const F32x16 zero = broadcast(0.0f), inv = broadcast(1.0f) / p.det;
+    F32x16 gu, gv;
+    apply_inverse(p, zero - sum[kSx], zero - sum[kSy], inv, gu, gv);
     mean2d[0] = gu * broadcast(0.5f * static_cast<float>(cam.width)), mean2d[1] = gv * broadcast(0.5f * static_cast<float>(cam.height));
-    F32x16 gxx, gxy, gyy;
-    differentiate_covariance(p, sum, s.antialias, gxx, gxy, gyy);
     const Rotation rotation(q);
     F32x16 d_rotation[3][3], d_t[2][3], d_a[2][3];
     for (int j = 0; j < 3; ++j) {
-      const F32x16 b0 = two * fma(gxx, p.b[0][j], gxy * p.b[1][j]), b1 = two * fma(gxy, p.b[0][j], gyy * p.b[1][j]);
+      F32x16 b0, b1;
+      differentiate_axis(p, sum, inv, s.antialias, j, b0, b1);
       scale[j] = fma(b0, p.a[0][j], b1 * p.a[1][j]);
       d_a[0][j] = b0 * size[j], d_a[1][j] = b1 * size[j];
       for (int k = 0; k < 3; ++k) d_rotation[k][j] = fma(p.t[0][k], d_a[0][j], p.t[1][k] * d_a[1][j]);

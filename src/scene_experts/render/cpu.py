@@ -41,24 +41,28 @@ class CpuRasterizer:
     absolute: bool = False
 
     def __post_init__(self) -> None:
-        if native.load(self.level) is None:
-            why = native.explain_missing() if self.level is None else f"no compiled CPU library for {self.level} is installed"
-            raise InputError(f"{why}; or choose the slow rasteriser `reference`")
+        try:
+            native.require(self.level)
+        except InputError as error:
+            raise InputError(f"{error}; or choose the slow rasteriser `reference`") from None
 
     def __call__(self, g: Gaussians, camera: Camera, background: Tensor) -> Render:
         """Render M Gaussians over `background` [3]; see `types.Render`. The backward pass
         overwrites `mean2d_grad`."""
-        inputs = (g.means, g.quats, g.scales, g.opacities, g.colors)
-        _check(inputs)
+        inputs = {"means": g.means, "quats": g.quats, "scales": g.scales, "opacities": g.opacities, "colors": g.colors}
+        _check(inputs, len(g))
+        _check({"background": background})
         _check_size(camera)
         mean2d_grad = torch.zeros((len(g), 2))
-        image, alpha, depth, radii = _Draw.apply(*inputs, background, self, camera, mean2d_grad)
+        image, alpha, depth, radii = _Draw.apply(*inputs.values(), background, self, camera, mean2d_grad)
         return Render(image, alpha, depth, radii, mean2d_grad)
 
     @torch.no_grad()
     def visible(self, means: Tensor, scales: Tensor, camera: Camera) -> Tensor:
         """Mask [A] bool of the unrotated Gaussians at `means` [A, 3] with `scales` [A, 3] that have
         a radius > 0 (Scaffold-GS)."""
+        _check({"means": means, "scales": scales}, len(means))
+        _check_size(camera)
         means, scales = _convert(means), _convert(scales)
         out = torch.empty(len(means), dtype=torch.bool)
         where = [native.pointer(t) for t in (means, scales, out)]
@@ -124,10 +128,14 @@ def convert_camera(camera: Camera) -> SeCamera:
     return SeCamera((ctypes.c_float * 12)(*rows), fx, fy, cx, cy, camera.near, camera.width, camera.height)
 
 
-def _check(inputs: tuple[Tensor, ...]) -> None:
-    count = len(inputs[0])
-    for tensor, name, width in zip(inputs, ("means", "quats", "scales", "opacities", "colors"), (3, 4, 3, None, 3), strict=True):
-        expected = (count,) if width is None else (count, width)
+_WIDTHS = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "colors": (3,), "background": (3,)}
+
+
+def _check(inputs: dict[str, Tensor], *count: int) -> None:
+    """Raise InputError unless each of the named tensors lies on the CPU and has its shape, after a
+    first axis of `count`, if given."""
+    for name, tensor in inputs.items():
+        expected = (*count, *_WIDTHS[name])
         if tensor.shape != expected or not tensor.is_cpu:
             found = f"{tuple(tensor.shape)} on {tensor.device}"
             raise InputError(f"expected {name} of shape {expected} on the CPU, found {found}")
