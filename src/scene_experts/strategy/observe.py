@@ -16,6 +16,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
+from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
 from scene_experts.core.types import Decoded, Render
 from scene_experts.native import library as native
@@ -49,14 +50,18 @@ def observe(table: Table, decoded: Decoded, render: Render) -> None:
     assert decoded.raw_opacity is not None
     raw, library = decoded.raw_opacity.detach(), native.load()
     columns = [table.stats[name] for name in STATS]
+    rows, slots = (len(table),), (len(table), raw.shape[1])
+    if [tuple(column.shape) for column in columns] != [rows, rows, slots, slots]:
+        found = ", ".join(str(list(column.shape)) for column in columns)
+        raise InputError(f"expected statistics of {rows[0]:,} rows and {slots[1]} slots each, found shapes {found}; begin the training anew")
     parts = [*columns, raw, render.mean2d_grad]
     if triton.covers(*parts):
         return _launch(table.stats, decoded, render, raw.contiguous())
     if library is None or not all(t.device.type == "cpu" and t.dtype == torch.float32 and t.is_contiguous() for t in parts):
         return _by_torch(table.stats, decoded, render)
     visits, opacity = native.pointer(table.stats["visits"]), native.pointer(table.stats["opacity"])
-    rows = decoded.rows.contiguous()
-    library.se_observe_rows(native.pointer(rows), native.pointer(raw), len(rows), raw.shape[1], visits, opacity, native.count_threads())
+    drawn = decoded.rows.contiguous()
+    library.se_observe_rows(native.pointer(drawn), native.pointer(raw), len(drawn), raw.shape[1], visits, opacity, native.count_threads())
     observe_drawn(table.stats, decoded, render)
 
 

@@ -38,6 +38,9 @@ class Optimizer(Part, ABC):
 
     prefix: ClassVar[str] = "optimizer"
     """First word of the names that its state has in checkpoints."""
+    moments: ClassVar[tuple[str, ...] | None] = None
+    """Names of the tensors of a parameter's shape in its state, which has one more, `step`; None: not
+    known, and a checkpoint may have any."""
     by_row: ClassVar[bool] = False
     """Whether `step(rows=...)` of the built optimiser can move some rows of a table only;
     --sparse-adam needs it."""
@@ -67,6 +70,7 @@ class Adam(Optimizer):
     """Adam (Kingma and Ba 2015) without weight decay."""
 
     prefix = "adam"
+    moments = ("exp_avg", "exp_avg_sq")
     by_row = True
 
     betas: Annotated[tuple[float, float], Range(0, below=1)] = (0.9, 0.999)

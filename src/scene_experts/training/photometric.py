@@ -80,7 +80,11 @@ def photometric(image: Tensor, target: Tensor, lambda_dssim: float, mask: Tensor
         lambda_dssim: Weight of 1 - SSIM, 0 to 1.
         mask: [H, W] in [0, 1]; pixels with 0 are ignored. The target replaces the image at ignored
             pixels, and both terms are divided by the mean of the mask.
+
+    Raises ValueError unless image and target have the same shape, with three channels.
     """
+    if image.shape != target.shape or image.dim() != 3 or image.shape[-1] != 3:
+        raise ValueError(f"expected an image and a target of one shape [H, W, 3], found {list(image.shape)} and {list(target.shape)}")
     if mask is not None:
         image = torch.lerp(target, image, mask.to(image.dtype)[..., None])
     if triton.covers(image, target) and not target.requires_grad and image.numel() > 0:

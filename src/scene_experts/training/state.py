@@ -31,6 +31,7 @@ from scene_experts.training.guard import check_state
 from scene_experts.training.memory import Largest
 from scene_experts.training.rate import MODEL, RateTerm
 from scene_experts.training.resident import Resident
+from scene_experts.training.restoring import restore_moments, restore_stats
 
 log: logging.Logger = logging.getLogger(__name__)
 
@@ -235,19 +236,14 @@ class Training:
         scene = restore_foreign(cfg.scene, tensors, meta)
         scene.exposures = Exposures.restore(tensors) if cfg.exposure else None
         scene.poses = Poses.restore(tensors)  # without --refine-poses too: those of --init-from
-        scene.table.stats = {k.removeprefix("stats."): v for k, v in tensors.items() if k.startswith("stats.")}
+        restore_stats(scene, tensors)
         training = cls(cfg, scene.to(device))
         table = training.scene.table
         if training.rate is not None and training.scene.rounding is not None:
             groups = training.rate.prepare(training.scene)
             training.add_groups({MODEL: groups[MODEL]})  # the scene's own are there
             training.rate.restore(training.scene, tensors)
-        for group in training.optimizer.param_groups:
-            for i, parameter in enumerate(group["params"]):
-                prefix = f"{cfg.optimizer.prefix}.{group['name']}.{i}."
-                state = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
-                if state:
-                    training.optimizer.state[parameter] = {k: v.to(device) for k, v in state.items()}
+        restore_moments(cfg.optimizer, training.optimizer, tensors)
         if training.averages is not None:
             training.averages.restore(tensors)
         torch.set_rng_state(tensors["rng.torch"])

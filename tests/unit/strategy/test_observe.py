@@ -3,10 +3,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from scene_experts.core.errors import InputError
 from scene_experts.core.table import Table
 from scene_experts.core.types import Decoded, Gaussians, Render
 from scene_experts.native import library as native
 from scene_experts.strategy import observe
+from support.messages import naming
 
 K = 3
 
@@ -34,6 +36,15 @@ def test_counts_follow_the_rule_over_two_views():
     observe.stop(table)
     assert not table.stats
     observe.stop(table)  # twice is fine
+
+
+@pytest.mark.parametrize("name, shape", [("visits", (1,)), ("opacity", (4, K)), ("grad", (4,)), ("count", (4, K + 1))])
+def test_statistics_of_other_shapes_are_refused(name, shape):
+    table = Table({"a": torch.zeros(4, 1)}, {})
+    observe.start(table, K)
+    table.stats[name] = torch.zeros(shape)
+    with pytest.raises(InputError, match=naming("4 rows", "3 slots", str(list(shape)))):
+        observe.observe(table, *view([1], [[0.5, -0.2, 0.1]], [3], [4], [[3.0, 4.0]]))
 
 
 def test_a_training_in_float64_counts_in_float64():

@@ -125,3 +125,9 @@ def test_a_mask_leaves_out_what_it_covers():
 def test_a_picture_without_pixels_costs_nothing():
     empty = torch.zeros(0, 5, 3)
     assert float(l1(empty, empty)) == 0.0
+
+
+@pytest.mark.parametrize("image, target", [((60, 60, 3), (2, 2, 3)), ((8, 8, 4), (8, 8, 4)), ((8, 8), (8, 8)), ((3, 8, 8), (3, 8, 8))])
+def test_pictures_of_other_shapes_are_refused(image, target):
+    with pytest.raises(ValueError, match="one shape"):
+        photometric(torch.zeros(image), torch.zeros(target), 0.2)

@@ -149,7 +149,9 @@ class _Decode(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple:  # pyright: ignore[reportIncompatibleMethodOverride]
-        drawn: DrawnView = ctx.drawn
+        drawn: DrawnView | None = ctx.drawn
+        if drawn is None:
+            raise RuntimeError("expected one backward pass of a decoded view, found a second: its memory is free; decode the view again")
         ctx.drawn = None
         nets, columns = drawn.view.nets, drawn.view.columns
         means, quats, scales, opacities, colors, _, raw = (g.contiguous() for g in upstream[:7])
