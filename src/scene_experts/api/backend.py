@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -63,15 +64,38 @@ def _warn(reason: str) -> None:
     warnings.warn(f"the GPU is not used, and the CPU is: {reason}", stacklevel=4)
 
 
-@contextmanager
-def deterministic(on: bool) -> Iterator[None]:
-    """Make torch use its deterministic algorithms inside the `with` block, where `on`; then restore
-    the earlier choice."""
-    before, warn_only = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
-    if on:
-        torch.use_deterministic_algorithms(True, warn_only=True)
-    try:
-        yield
-    finally:
-        if on:
-            torch.use_deterministic_algorithms(before, warn_only=warn_only)
+class OwnState:
+    """What a training has for itself of what torch has for the whole process: the state of the
+    random numbers, and whether deterministic algorithms are used."""
+
+    _turn = threading.RLock()
+
+    def __init__(self, device: str, deterministic: bool) -> None:
+        self._cuda, self._deterministic = device == "cuda", deterministic
+        self._random: list[torch.Tensor] | None = None
+
+    @contextmanager
+    def __call__(self) -> Iterator[None]:
+        """Use this state inside the `with` block, one thread at a time; then restore that of the
+        caller."""
+        with self._turn:
+            random, before = self._get(), torch.are_deterministic_algorithms_enabled()
+            warn_only = torch.is_deterministic_algorithms_warn_only_enabled()
+            self._set(random if self._random is None else self._random)
+            if self._deterministic:
+                torch.use_deterministic_algorithms(True, warn_only=True)
+            try:
+                yield
+            finally:
+                self._random = self._get()
+                self._set(random)
+                if self._deterministic:
+                    torch.use_deterministic_algorithms(before, warn_only=warn_only)
+
+    def _get(self) -> list[torch.Tensor]:
+        return [torch.get_rng_state(), *([torch.cuda.get_rng_state()] if self._cuda else [])]
+
+    def _set(self, random: list[torch.Tensor]) -> None:
+        torch.set_rng_state(random[0])
+        if self._cuda:
+            torch.cuda.set_rng_state(random[1])

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from scene_experts.api import checked
 from scene_experts.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -55,11 +56,13 @@ class Camera:
             )
         if not (K[0, 0] > 0 and K[1, 1] > 0) or K[0, 1] != 0 or K[1, 0] != 0 or K[2].tolist() != [0, 0, 1]:
             raise InputError(f"expected K as [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy above 0, found {K.tolist()}; correct it")
-        if not all(isinstance(side, (int, np.integer)) and 1 <= side <= LARGEST for side in (self.width, self.height)):
-            raise InputError(f"expected a width and height from 1 to {LARGEST} px, found {self.width} x {self.height}; use whole numbers")
-        if self.near is not None and not 0 < self.near < math.inf:
+        width, height = checked.side("width", self.width), checked.side("height", self.height)
+        if max(width, height) > LARGEST:
+            raise InputError(f"expected a width and height from 1 to {LARGEST} px, found {width} x {height}; choose a smaller size")
+        view = checked.integer("view", self.view, -1)
+        if self.near is not None and not checked.real("near", self.near) > 0:
             raise InputError(f"expected near as a length above 0, found {self.near}; leave it out for the run's own")
-        for name, value in (("world_to_camera", pose), ("K", K), ("width", int(self.width)), ("height", int(self.height))):
+        for name, value in (("world_to_camera", pose), ("K", K), ("width", width), ("height", height), ("view", view)):
             object.__setattr__(self, name, value)
 
     @classmethod
@@ -135,6 +138,7 @@ class Camera:
         """
         given = np.array(camera_to_world, dtype=np.float64) if is_numbers(camera_to_world) else np.zeros(0)
         pose = matrix(np.vstack([given, [0, 0, 0, 1]]) if given.shape == (3, 4) else given, 4, "camera_to_world")
+        width, height = checked.side("width", width), checked.side("height", height)
         K = [[fx, 0, width / 2 if cx is None else cx], [0, fx if fy is None else fy, height / 2 if cy is None else cy], [0, 0, 1]]
         rotation, back = pose[:3, :3], np.eye(4)
         u, scales, v = np.linalg.svd(rotation)
@@ -164,6 +168,7 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """Return the camera with a picture of another size, px. Another aspect ratio stretches the
         picture."""
+        width, height = checked.side("width", width), checked.side("height", height)
         factor = np.array([[width / self.width], [height / self.height], [1.0]])
         return replace(self, K=self.K * factor, width=width, height=height)
 
@@ -175,7 +180,8 @@ class Camera:
 def lens(fov: float, width: int, height: int) -> NDArray[np.float64]:
     """K [3, 3] of a vertical field of view in degrees, with the principal point in the middle.
     Raises InputError for no field of view."""
-    if not 0 < fov < 180:
+    width, height = checked.side("width", width), checked.side("height", height)
+    if not 0 < checked.real("fov", fov) < 180:
         raise InputError(f"expected fov between 0 and 180 degrees, found {fov}; correct it")
     focal = height / (2 * math.tan(math.radians(fov) / 2))
     return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NoReturn
 
 import numpy as np
 import torch
@@ -109,7 +109,8 @@ class Capture:
         return paths.analyse_cameras(self.loaded).up.numpy()
 
     def photo(self, view: int | str | Camera) -> NDArray[np.float32]:
-        """Return the photograph of a view, undistorted and at the resolution of its camera.
+        """Return the photograph of a view, undistorted and at the resolution that the capture was
+        loaded with.
 
         Args:
             view: Index of the view, its name, or its camera.
@@ -162,10 +163,10 @@ class Capture:
             InputError: `eye` and `target` are the same point, or a value is out of range.
         """
         seen = paths.analyse_cameras(self.loaded)
-        model = paths.median_camera(seen.cameras, size)
+        model = paths.median_camera(seen.cameras, checked.size("size", size))
         aim = self.centre if target is None else vector(target, "target")
         upward = self.up if up is None else vector(up, "up")
-        angle = float(np.degrees(model.fov)) if fov is None else fov
+        angle = float(np.degrees(model.fov)) if fov is None else checked.real("fov", fov)
         return Camera.look_at(eye, aim, upward, width=model.width, height=model.height, fov=angle)
 
     def camera_path(
@@ -186,7 +187,7 @@ class Capture:
             InputError: The kind is unknown, or there are no frames.
         """
         expect_among("kind", kind, paths.NAMES)
-        made = paths.make_path(kind, self.loaded, checked.integer("frames", frames, 1), size)
+        made = paths.make_path(kind, self.loaded, checked.integer("frames", frames, 1), checked.size("size", size))
         return [from_trained(camera, self.loaded.world) for camera in made.cameras]
 
     def with_seed(self, seed: int) -> Capture:
@@ -225,6 +226,10 @@ class Capture:
         reach = max(float(away.max()), self.loaded.extent / self.loaded.world.scale)
         near = float(away[index]) <= min(float(away.min()) + 1e-4 * reach, MOVED * reach)
         return near and float(forward @ camera.world_to_camera[2, :3]) > TURNED
+
+    def __reduce__(self) -> NoReturn:
+        where = f"load_capture({str(self.loaded.root)!r})"
+        raise InputError(f"expected something that can be copied to another process, found a capture; use {where} there")
 
     def __repr__(self) -> str:
         train, test = len(self.loaded.train), len(self.loaded.test)
@@ -288,7 +293,7 @@ def load_capture(
     Raises:
         InputError: The folder holds no usable capture, or an argument is invalid.
     """
-    if not isinstance(path, (str, Path)):
+    if not isinstance(path, (str, Path)) or not str(path):
         raise InputError(f"expected the folder of a capture, found {path!r}; give its path")
     brought = defaults_of(path)
     cloud = None if points is None else Path(points)

@@ -7,6 +7,7 @@ import math
 import typing
 from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,7 +21,7 @@ T = TypeVar("T")
 def integer(name: str, value: object, least: int | None = None) -> int:
     """Return an integer of at least `least`. Raises InputError, naming the argument, for anything
     else."""
-    if not isinstance(value, Integral) or (least is not None and value < least):
+    if isinstance(value, bool) or not isinstance(value, Integral) or (least is not None and value < least):
         what = "an integer" if least is None else f"an integer of at least {least}"
         raise InputError(f"expected {name} as {what}, found {value!r}; correct it")
     return int(value)
@@ -29,7 +30,7 @@ def integer(name: str, value: object, least: int | None = None) -> int:
 def real(name: str, value: object) -> float:
     """Return a finite number as a float. Raises InputError, naming the argument, for anything
     else."""
-    if not isinstance(value, Real) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
         raise InputError(f"expected {name} as a finite number, found {value!r}; correct it")
     return float(value)
 
@@ -39,6 +40,30 @@ def boolean(name: str, value: object) -> bool:
     if not isinstance(value, (bool, np.bool_)):
         raise InputError(f"expected {name} as True or False, found {value!r}; correct it")
     return bool(value)
+
+
+def side(name: str, value: object) -> int:
+    """Return the length of a picture's side, px. Raises InputError, naming the argument, for anything
+    but an integer of at least 1."""
+    return integer(f"{name} in px", value, 1)
+
+
+def size(name: str, value: object) -> tuple[int, int] | None:
+    """Return the width and height of a picture, px; None for None. Raises InputError, naming the
+    argument, for anything else."""
+    if value is None:
+        return None
+    if not isinstance(value, (tuple, list, np.ndarray)) or np.shape(value) != (2,):
+        raise InputError(f"expected {name} as a width and a height, found {value!r}; correct it")
+    return side(f"the width in {name}", value[0]), side(f"the height in {name}", value[1])
+
+
+def path(name: str, value: object) -> Path:
+    """Return a path that stays the same when the working folder changes. Raises InputError, naming
+    the argument, for anything but a path."""
+    if not isinstance(value, (str, Path)) or not str(value):
+        raise InputError(f"expected {name} as a path, found {value!r}; correct it")
+    return Path(value).absolute()
 
 
 def fields(kind: type[T], given: Mapping[str, Any]) -> T:

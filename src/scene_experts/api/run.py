@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 import torch
@@ -32,6 +32,7 @@ from scene_experts.files.importing import import_files
 from scene_experts.render import Rasterizer, as_trained
 from scene_experts.report import page
 from scene_experts.scene import Draws, Scene
+from scene_experts.scene.anchors.mlp import ATTRIBUTES
 from scene_experts.training import run_folder, state
 from scene_experts.training.run_folder import OpenRun
 from scene_experts.training.state import Training
@@ -180,6 +181,7 @@ class Run:
             InputError: `show` is unknown, or needs experts that the scene does not have.
         """
         expect_among("show", show, SHOWS)
+        expect_among("attribute", attribute, ATTRIBUTES)
         view, background = self._view(camera)
         return numpy(paint(self.scene, view, self.step, self._rasterize, background, Look(show=show, attribute=attribute), self._frozen()))
 
@@ -213,7 +215,9 @@ class Run:
                 the encoder is not installed.
             RunError: The encoder fails, or the disk is full.
         """
-        path, cameras = Path(out), list(cameras)
+        if isinstance(cameras, Camera):
+            raise InputError("expected cameras, one for each frame, found a single one; give a list, or use `render` for a picture")
+        path, cameras, fps, quality = checked.path("out", out), list(cameras), checked.real("fps", fps), checked.integer("quality", quality)
         if not cameras or not 0 < fps < 1000 or not 1 <= quality <= 10:
             raise InputError(f"expected cameras, fps above 0 and quality from 1 to 10, found {len(cameras)} cameras, {fps} and {quality}")
         if path.suffix and not video.is_video(path) and not path.is_dir():
@@ -355,7 +359,7 @@ class Run:
             InputError: The run is in a folder already, or `out` holds something else.
             RunError: The disk is full.
         """
-        training, folder, config = self._training, Path(out), self._opened.config
+        training, folder, config = self._training, checked.path("out", out), self._opened.config
         if training is None:
             raise InputError(f"expected a run in memory to save, found one in {self._opened.path}; copy that folder")
         run_folder.check(folder, config, resume=False)
@@ -394,16 +398,23 @@ class Run:
     def _in_folder(self, what: str) -> Path:
         if self._training:
             raise InputError(f"expected a run in a folder for `{what}`, found one in memory; call `save(FOLDER)` first")
-        return self._opened.path
+        path = self._opened.path
+        if not (path / "config.json").is_file():
+            raise InputError(f"expected the run folder {path}, found none: it was moved or removed; open it with `open_run` where it is now")
+        return path
 
     @contextmanager
     def _folder(self) -> Iterator[Path]:
         """The run folder, or a temporary one for a run in memory."""
         if self._training is None:
-            yield self._opened.path
+            yield self._in_folder("evaluate")
             return
         with tempfile.TemporaryDirectory() as folder:
             yield Path(folder)
+
+    def __reduce__(self) -> NoReturn:
+        where = f"open_run({str(self.path)!r})" if self.path else "save(FOLDER), and open_run(FOLDER)"
+        raise InputError(f"expected something that can be copied to another process, found a run; use {where} there")
 
     def __repr__(self) -> str:
         return f"Run({self.recipe.recipe!r}, step {self.step:,}, {len(self.scene.table):,} rows, {self.path or 'in memory'})"
@@ -435,8 +446,9 @@ def open_run(
         InputError: The folder is no run, has no such checkpoint, or the device or rasteriser is not
             available.
     """
+    folder, step = checked.path("path", path), None if step is None else checked.integer("step", step, 0)
     where, rasterize = backend(device, rasterizer, False, False)
-    return Run(run_folder.open_run(Path(path), where, step), where, rasterize, data=None if data is None else Path(data))
+    return Run(run_folder.open_run(folder, where, step), where, rasterize, data=None if data is None else checked.path("data", data))
 
 
 def import_run(
@@ -466,5 +478,6 @@ def import_run(
             else.
     """
     known = capture if isinstance(capture, Capture) else load_capture(capture)
-    import_files(Path(source), known.data, Path(out), iteration, None if transform is None else Path(transform))
-    return open_run(out, device=device)
+    into = checked.path("out", out)
+    import_files(Path(source), known.data, into, iteration, None if transform is None else Path(transform))
+    return open_run(into, device=device)

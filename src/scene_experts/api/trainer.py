@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import TypedDict, Unpack
 
 from scene_experts.api import checked, recording
-from scene_experts.api.backend import Device, Raster, device_of
-from scene_experts.api.backend import deterministic as deterministic_algorithms
+from scene_experts.api.backend import Device, OwnState, Raster, device_of
 from scene_experts.api.capture import Capture, load_capture
 from scene_experts.api.command_line import command_of
 from scene_experts.api.recipe import Recipe, recipe
@@ -76,7 +75,7 @@ class Trainer:
             stop_at: Stop at this iteration of the unchanged schedule; `iterations` of the recipe
                 rescales the schedule instead.
             deterministic: Bit-identical results on one machine, resumed or not; a little slower.
-                Until the training ends, torch uses deterministic algorithms in the whole process.
+                While it computes the next event, torch uses deterministic algorithms.
             device: "cpu", "cuda", or "auto" (CUDA if torch finds it and gsplat is installed).
             rasterizer: "cpu" (compiled), "gsplat" (CUDA), "reference" (plain torch, slow), or
                 "auto" (the fastest on the device).
@@ -95,7 +94,7 @@ class Trainer:
                 the run.
         """
         self.recipe = recipe(method)
-        folder = None if out is None else Path(out)
+        folder = None if out is None else checked.path("out", out)
         if folder is None and (resume or overwrite or tensorboard):
             raise InputError("expected a run folder `out` for resume, overwrite or tensorboard, found None; name one")
         options = checked.fields(TrainOptions, locals())
@@ -107,7 +106,7 @@ class Trainer:
         self.capture = loaded.with_seed(self.recipe.seed)
         if isinstance(method, str):
             self.recipe = with_numbers(self.recipe, self.capture.numbers)
-        words = command_of(self.recipe, self.capture.data, folder, options)
+        words = command_of(self.recipe, self.capture.data, None if out is None else Path(out), options)
         config = RunConfig.of(self.recipe, self.capture.data, options, words, run_folder.versions())
         recording.check_settings(Job(config, options=options))
         if folder is not None:
@@ -120,6 +119,7 @@ class Trainer:
         self._rasterize = rasterize
         self._training: Training | None = None
         self._ended = False
+        self._own = OwnState(where, options.deterministic)
         self._events = self._train()
 
     def __iter__(self) -> Iterator[Event]:
@@ -127,8 +127,13 @@ class Trainer:
         return self
 
     def __next__(self) -> Event:
-        """Train until the next event. Raises StopIteration when the training has ended."""
-        return next(self._events)
+        """Train until the next event. Raises StopIteration when the training has ended.
+
+        Random numbers that the caller takes from torch do not change the training, nor it theirs.
+        Trainings in several threads take turns, from event to event.
+        """
+        with self._own():
+            return next(self._events)
 
     @property
     def run(self) -> Run:
@@ -163,8 +168,7 @@ class Trainer:
 
     def _train(self) -> Iterator[Event]:
         reuse_freed()
-        with deterministic_algorithms(self._run.options.deterministic):
-            yield from recording.train(self._run, self.capture.loaded, self._rasterize)
+        yield from recording.train(self._run, self.capture.loaded, self._rasterize)
         self._ended = True
         if self._run.out is not None:
             self._training = None  # the run is in its folder now

@@ -3,6 +3,7 @@ requested, TensorBoard files."""
 
 from __future__ import annotations
 
+import errno
 import json
 from dataclasses import asdict
 from pathlib import Path
@@ -78,7 +79,9 @@ class Recorder:
             with self.path.open("a") as stream:
                 stream.write(json.dumps(value) + "\n")
         except OSError as error:
-            raise RunError(f"cannot write {self.path}: {error.strerror}; free some space and continue with --resume") from error
+            full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+            advice = "free some space" if full else f"look whether {self.path.parent} is still there and may be written"
+            raise RunError(f"cannot write {self.path}: {error.strerror}; {advice}, and continue with --resume") from error
 
     def write_scalars(self, event: Stepped) -> None:
         """Write the values of an iteration to TensorBoard."""

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from scene_experts.api import backend as module
-from scene_experts.api.backend import backend, deterministic, device_of
+from scene_experts.api.backend import OwnState, backend, device_of
 from scene_experts.core.errors import InputError
 
 
@@ -34,8 +34,25 @@ def test_auto_takes_cuda_only_with_a_fast_rasteriser(monkeypatch):
 
 def test_deterministic_algorithms_end_with_their_block():
     before = torch.are_deterministic_algorithms_enabled()
-    with deterministic(True):
+    with OwnState("cpu", True)():
         assert torch.are_deterministic_algorithms_enabled()
     assert torch.are_deterministic_algorithms_enabled() == before
-    with deterministic(False):
+    with OwnState("cpu", False)():
         assert torch.are_deterministic_algorithms_enabled() == before
+
+
+def test_random_numbers_are_apart_from_those_of_the_caller():
+    torch.manual_seed(3)
+    expected, alone = torch.rand(2), torch.Generator().manual_seed(5)
+    torch.manual_seed(3)
+    own, found = OwnState("cpu", False), []
+    with own():
+        torch.manual_seed(5)
+        found.append(torch.rand(4))
+    assert torch.equal(torch.rand(2), expected)
+    with pytest.raises(KeyError), own():  # also after an error
+        found.append(torch.rand(4))
+        raise KeyError
+    with own():
+        found.append(torch.rand(4))
+    assert all(torch.equal(numbers, torch.rand(4, generator=alone)) for numbers in found)

@@ -1,5 +1,7 @@
 """Cameras in the capture's own frame."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,9 @@ import torch
 import scene_experts as se
 from scene_experts.api.camera import from_trained, to_trained
 from scene_experts.data.views import World
+
+
+SMALL = se.Camera.look_at((0, 0, 1), (0, 0, 0), width=8, height=8)
 
 
 def test_a_camera_looks_where_it_is_told():
@@ -50,6 +55,16 @@ def test_a_rounded_rotation_does_not_move_the_camera():
         (lambda: se.Camera.from_pose(np.eye(4), width=8, height=8, fx=-9), "fx"),
         (lambda: se.Camera.from_pose(np.eye(4), width=8, height=8, fx=9, near=0), "near"),
         (lambda: se.Camera(np.eye(4), np.ones((3, 3)), 8, 8), "K as"),
+        (lambda: se.Camera.from_pose(np.eye(4), width="8", height=8, fx=9), "width in px.*'8'"),
+        (lambda: se.Camera.from_pose(np.eye(4), width=True, height=8, fx=9), "width in px.*True"),
+        (lambda: se.Camera.from_pose(np.eye(4), width=8, height=20_000, fx=9), "16384"),
+        (lambda: se.Camera.look_at((0, 0, 1), (0, 0, 0), width=None, height=8), "width in px.*None"),
+        (lambda: se.Camera.look_at((0, 0, 1), (0, 0, 0), width=8, height=8, fov="60"), "fov.*'60'"),
+        (lambda: replace(SMALL, near="1"), "near.*'1'"),
+        (lambda: replace(SMALL, view="a"), "view.*'a'"),
+        (lambda: replace(SMALL, view=-5), "view.*-5"),
+        (lambda: replace(SMALL, view=1.5), "view.*1.5"),
+        (lambda: SMALL.resized(4.5, 4), "width in px.*4.5"),
     ],
 )
 def test_what_is_no_camera_is_told_in_a_sentence(make, said):

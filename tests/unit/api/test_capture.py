@@ -80,6 +80,15 @@ def test_a_new_camera_takes_the_lens_of_the_photographs(capture):
     assert (small.width, small.height, round(small.fov)) == (20, 10, 33)
 
 
+@pytest.mark.parametrize("size", [320, (32,), (32, 24.5), "32x24", np.zeros((2, 2)), (0, 24)])
+def test_a_size_that_is_none_is_named(capture, size):
+    for call in (lambda: capture.look_at((9, 9, 9), size=size), lambda: capture.camera_path(frames=2, size=size)):
+        with pytest.raises(se.InputError, match="in px|width and a height"):
+            call()
+    for good in ((32, 24), np.array([32, 24])):
+        assert capture.look_at((9, 9, 9), size=good).width == 32
+
+
 def test_an_orbit_goes_around_the_centre(capture):
     cameras = capture.camera_path("orbit", frames=5, size=(20, 10))
     away = [np.linalg.norm(camera.position - capture.centre) for camera in cameras]
@@ -161,6 +170,9 @@ def test_a_camera_of_another_capture_has_no_photograph_here(tmp_path):
         lambda: se.recipe(None),
         lambda: se.make("x", "y", minutes="10"),
         lambda: se.make("x", "y", options={"frames": 30}),
+        lambda: se.load_capture(""),
+        lambda: se.open_run(None),
+        lambda: se.open_run("x", step="60"),
     ],
 )
 def test_arguments_of_another_kind_are_told_in_one_sentence(call):

@@ -15,7 +15,7 @@ def test_numbers_of_numpy_become_plain_ones():
     assert values == (3, 0.5, False) and [type(value) for value in values] == [int, float, bool]
 
 
-@pytest.mark.parametrize("value", [1.0, "1", None, 0, float("nan")])
+@pytest.mark.parametrize("value", [1.0, "1", None, 0, float("nan"), True])
 def test_what_is_no_integer_is_refused(value):
     with pytest.raises(se.InputError, match="stop_at as an integer of at least 1"):
         checked.integer("stop_at", value, 1)

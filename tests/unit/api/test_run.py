@@ -1,6 +1,8 @@
 """Runs: drawn, scored, exported, found again."""
 
+import copy
 import json
+import pickle
 import shutil
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import torch
 from PIL import Image
 
 import scene_experts as se
+from scene_experts.core.errors import InputError
 from scene_experts.evaluate.pictures import to_8bit
 from support.messages import naming
 from support.synthetic import make_capture
@@ -63,6 +66,37 @@ def test_a_run_opens_from_any_folder(run, capture, tmp_path, monkeypatch):
     assert len(opened.train_cameras) == 7 and "step 6" in repr(opened) and opened.scene.table is not None
 
 
+def test_a_run_stays_in_its_folder(run, capture, tmp_path, monkeypatch):
+    """A working folder with another run of the same relative name is left alone."""
+    for place in ("here", "there"):
+        shutil.copytree(run.path, tmp_path / place / "runs" / "a")
+        (tmp_path / place / "runs" / "a" / "results.json").unlink(missing_ok=True)
+    monkeypatch.chdir(tmp_path / "here")
+    opened = se.open_run("runs/a", data=capture.loaded.root)
+    monkeypatch.chdir(tmp_path / "there")
+    opened.evaluate(lpips=False)
+    assert (tmp_path / "here" / "runs" / "a" / "results.json").is_file() and not Path("runs/a/results.json").exists()
+
+
+def test_a_folder_that_is_gone_is_not_made_again(run, capture, tmp_path):
+    shutil.copytree(run.path, tmp_path / "run")
+    opened = se.open_run(tmp_path / "run", data=capture.loaded.root)
+    shutil.rmtree(tmp_path / "run")
+    for call in (lambda: opened.evaluate(lpips=False), lambda: opened.export("compact"), opened.report):
+        with pytest.raises(InputError, match=naming(str(tmp_path / "run"), "removed")):
+            call()
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("copies", [pickle.dumps, copy.deepcopy])
+def test_other_processes_open_a_run_themselves(run, capture, small, copies):
+    for value, said in ((run, f"open_run({str(run.path)!r})"), (capture, f"load_capture({str(capture.loaded.root)!r})")):
+        with pytest.raises(InputError, match=naming(said)):
+            copies(value)
+    with pytest.raises(InputError, match=naming("save(FOLDER)")):
+        copies(se.train(small, capture, progress=False))
+
+
 def test_a_capture_that_moved_is_named(run, capture, small, tmp_path):
     moved = tmp_path / "moved"
     shutil.copytree(capture.path, tmp_path / "first")
@@ -94,6 +128,12 @@ def test_words_that_mean_nothing_are_named(run, tmp_path):
     for number in ({"sh_degree": 1.5}, {"cells": 1}, {"max_gaussians": 10.5}, {"refine": "5"}, {"quality": "0.1"}):
         with pytest.raises(se.InputError, match=naming(*number)):
             run.export("ply", tmp_path / "scene.ply", **number)
+    with pytest.raises(InputError, match=naming("attribute", "colour")):
+        run.render(run.test_cameras[0], attribute="colour")
+    with pytest.raises(InputError, match=naming("a single one")):
+        run.write_video(tmp_path / "flight.mp4", run.test_cameras[0])
+    with pytest.raises(InputError, match=naming("fps", "'24'")):
+        run.write_video(tmp_path / "flight.mp4", run.test_cameras, fps="24")
     assert before == {path: path.stat().st_mtime_ns for path in run.path.rglob("*")} and not list(tmp_path.iterdir())
 
 

@@ -3,7 +3,9 @@
 import dataclasses
 import inspect
 import os
+import shutil
 import signal
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,9 +17,11 @@ import scene_experts as se
 from scene_experts.api.trainer import Settings
 from scene_experts.cli import main
 from scene_experts.core import checkpoint
+from scene_experts.core.errors import RunError
 from scene_experts.data.settings import Data
 from scene_experts.training.options import TrainOptions
 from scene_experts.training.run_folder import read_config
+from support.messages import naming
 
 FLAGS = ["--iterations", "6", "--scene.voxel-size", "0.2", "--deterministic", "--device", "cpu", "--save-every", "3"]
 
@@ -113,6 +117,54 @@ def test_a_loop_may_pause_go_on_and_stop(capture, small, tmp_path):
     assert last == se.Stopped(4, "enough") and trainer.run.path == tmp_path / "run" and trainer.run.step == 4
     done = se.Trainer(small, capture, tmp_path / "run", resume=True).finish()
     assert done.step == 6 and list(trainer) == []
+
+
+def digest(run: se.Run) -> list[float]:
+    return [float(value.detach().double().sum()) for value in run.scene.table.params.values()]
+
+
+def test_random_numbers_of_the_caller_change_no_training(capture):
+    """With dropped anchors, which come from torch's own random numbers."""
+    recipe = se.recipe("moe-gs", iterations=6, **{"scene.voxel_size": 0.2, "scene.dropout": 0.3, "scene.few_views": 0})
+    expected = digest(se.train(recipe, capture, progress=False))
+    torch.manual_seed(5)
+    wanted = torch.rand(3)
+    torch.manual_seed(5)
+    first, second = (se.Trainer(recipe, capture, log_every=1, deterministic=True) for _ in range(2))
+    for n, _ in enumerate(zip(first, second)):  # in turns
+        assert not torch.are_deterministic_algorithms_enabled()
+        assert n >= 3 or float(torch.rand(1)) == float(wanted[n])
+    assert digest(first.finish()) == digest(second.finish()) == expected
+    found: dict[int, list[float]] = {}
+
+    def train(number: int) -> None:
+        found[number] = digest(se.Trainer(recipe, capture, log_every=1).finish())
+
+    threads = [threading.Thread(target=train, args=(number,)) for number in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert found == {0: expected, 1: expected}
+
+
+def test_another_working_folder_does_not_move_the_run(capture, small, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    trainer = se.Trainer(small, capture, "run", log_every=1)
+    next(trainer)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert trainer.finish().path == tmp_path / "run" and not list(Path().iterdir())
+    assert "--out run" in read_config(tmp_path / "run").command
+
+
+def test_a_folder_that_is_gone_is_not_a_full_disk(capture, small, tmp_path):
+    trainer = se.Trainer(small, capture, tmp_path / "run", log_every=1)
+    next(trainer)
+    shutil.rmtree(tmp_path / "run")
+    with pytest.raises(RunError, match=naming(str(tmp_path / "run"), "still there")) as raised:
+        trainer.finish()
+    assert "free some space" not in str(raised.value)
 
 
 def test_ctrl_c_saves_and_is_raised(capture, tmp_path, monkeypatch):
