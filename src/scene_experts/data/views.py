@@ -178,6 +178,12 @@ class Capture:
         content = [[(v.name, v.camera.width, v.camera.height) for v in self.views], train, self.test]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
+    def photographs(self) -> str:
+        """Return a short hash of the names and sizes in bytes of the photographs and their masks: of
+        files that were replaced, or got masks, it is another one."""
+        sizes = [[v.name, _size_of(v.path), _size_of(s.mask and s.mask.path)] for v, s in zip(self.views, self.images.sources)]
+        return hashlib.sha256(json.dumps(sizes).encode()).hexdigest()[:16]
+
     def chosen(self) -> str:
         """Return a short hash of the names of the training views if --views leaves some out, else
         an empty string."""
@@ -215,6 +221,11 @@ class Capture:
                 f"expected the camera poses that {run or 'this run'} was trained with, found others in {self.root} (`capture --overwrite` "
                 "computes new ones); restore the former poses, or train anew"
             )
+
+
+def _size_of(path: Path | None) -> int | None:
+    """Return the size of a file in bytes; None without one."""
+    return path.stat().st_size if path is not None and path.exists() else None
 
 
 def same_poses(one: object, other: object) -> bool:

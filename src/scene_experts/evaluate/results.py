@@ -130,6 +130,7 @@ def describe_views(capture: Capture, cameras: Sequence[Camera], options: EvalOpt
         "mean_pixels": round(sum(c.width * c.height for c in cameras) / len(cameras)),
         **({} if capture.alpha_over is None else {"background": list(capture.alpha_over)}),
         "poses": capture.poses(),
+        "photographs": capture.photographs(),
         **({} if capture.points is None else {"points": len(capture.points.xyz)}),  # those of other poses are others
     }
 

@@ -3,6 +3,7 @@ of a smaller experiment."""
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import hashlib
 import json
@@ -158,7 +159,8 @@ def identity(scene: str, train: Train, data: Data, code: str = "", start: Path |
 
 def code_of(train: Train) -> str:
     """Return a hash of the source files of the packages, other than this one, that a recipe has
-    parts of; "" without such parts.
+    parts of; "" without such parts. To a module that is a single file belong those beside it that it
+    imports.
 
     A run is therefore trained again after a change of the code that it was trained with.
     """
@@ -167,13 +169,38 @@ def code_of(train: Train) -> str:
     found = hashlib.sha256()
     for name in sorted(names):
         module = sys.modules[name]
-        roots = [Path(place) for place in getattr(module, "__path__", ())]
-        files = [(path.relative_to(root), path) for root in roots for path in root.rglob("*.py")]
+        files = [file for place in getattr(module, "__path__", ()) for file in files_below(Path(place))]
         if not files and getattr(module, "__file__", None):
-            files = [(Path(name), Path(str(module.__file__)))]
-        for place, path in sorted(files):
-            found.update(f"{name} {place.as_posix()} ".encode() + hashlib.sha256(path.read_bytes()).digest())
+            files = files_of(Path(str(module.__file__)))
+        for label, path in sorted(files):
+            found.update(f"{name} {label} ".encode() + hashlib.sha256(path.read_bytes()).digest())
     return found.hexdigest()[:12] if names else ""
+
+
+def files_below(folder: Path) -> list[tuple[str, Path]]:
+    """Return the source files of a package, each with its place in it."""
+    return [(path.relative_to(folder).as_posix(), path) for path in folder.rglob("*.py")]
+
+
+def files_of(file: Path) -> list[tuple[str, Path]]:
+    """Return a source file, and those in its folder that it imports, also by way of others, each with
+    its name: modules and packages."""
+    found: dict[str, Path] = {}
+    left = [file]
+    while left:
+        path = left.pop()
+        if path.stem in found:
+            continue
+        found[path.stem] = path
+        for node in ast.walk(ast.parse(path.read_bytes())):
+            wanted = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            wanted += [node.module] if isinstance(node, ast.ImportFrom) and node.module and not node.level else []
+            for name in {each.partition(".")[0] for each in wanted}:
+                if (beside := file.with_name(f"{name}.py")).is_file():
+                    left.append(beside)
+                elif (file.parent / name / "__init__.py").is_file():
+                    found |= {f"{name}/{label}": below for label, below in files_below(file.parent / name)}
+    return list(found.items())
 
 
 def parts_of(value: Any) -> Iterator[Any]:
@@ -194,8 +221,9 @@ def find_own_scenes(captures: Sequence[Path]) -> list[CaptureSpec]:
     for scene in scenes:
         if not scene.path.is_dir():
             raise InputError(f"expected a capture folder at {scene.path}, found none; correct --captures")
-        if sum(other.name == scene.name for other in scenes) > 1:
-            raise InputError(f"expected captures with different names, found several called '{scene.name}'; rename one of them")
+        if len(same := [str(other.path.resolve()) for other in scenes if other.name == scene.name]) > 1:
+            found = f"found several called '{scene.name}': {', '.join(same)}"
+            raise InputError(f"expected captures with different names, {found}; rename one of these folders")
     return [replace(scene, options=held_out(scene.path)) for scene in scenes]
 
 

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import torch
 
-from scene_experts.core.errors import InputError
+from scene_experts.core.errors import InputError, few
 from scene_experts.core.fields import flag_of
 from scene_experts.core.io import write_bytes
+from scene_experts.core.plain import MOST_DIFFERENCES, differences, to_json
 from scene_experts.data import capture as captures
 from scene_experts.evaluate import pictures
 from scene_experts.evaluate.experts import draw_expert_strip
@@ -165,12 +166,12 @@ def draw_experts(spec: Spec, run: Path, out: Path, attribute: str = "color") -> 
     return path
 
 
-def adopt(run: Path, folder: Path) -> Path:
-    """Write the record of a run folder that another command trained. Its scene is the name of its
+def adopt(run: Path, wanted: Sequence[Spec]) -> Record:
+    """Return the record of a run folder that another command trained. Its scene is the name of its
     capture.
 
-    Raises InputError for a background or a near plane that are not those of the recipe: records take
-    them for those.
+    Raises InputError unless it is one of the `wanted` runs, and for a background or a near plane that
+    are not those of the recipe: records take them for those.
     """
     config = run_folder.read_config(run)
     train, data = config.train, config.data
@@ -184,4 +185,19 @@ def adopt(run: Path, folder: Path) -> Path:
             if right != other:
                 expected = f"the {name} that the recipe has on this capture, {right}"
                 raise InputError(f"expected {expected}, found {other} in {run}; train it without {flag_of(name)}")
-    return store.write(folder, store.read_run(run, captures.name_capture(Path(config.data.path)), code_of(config.train)))
+    found = store.read_run(run, captures.name_capture(Path(config.data.path)), code_of(config.train))
+    if all(store.find([found], spec) is None for spec in wanted):
+        raise InputError(f"expected --adopt with a run that this command asks for, found {describe_other(found, wanted)} in {run}; leave it out")
+    return found
+
+
+def describe_other(found: Record, wanted: Sequence[Spec]) -> str:
+    """Return what a record is, and in what it differs from the wanted run of its recipe, capture and
+    seed, if there is one."""
+    alike = [spec for spec in wanted if (spec.scene.name, spec.train.recipe, spec.seed) == (found.scene, found.recipe, found.seed)]
+    if not alike:
+        return f"{found.recipe} on {found.scene}, seed {found.seed},"
+    pairs = ((found.config.train, found.config.data), (alike[0].train, alike[0].data))
+    own, asked = ({**to_json(train), "data": to_json(replace(data, path=Path()))} for train, data in pairs)
+    other = few(differences(own, asked), MOST_DIFFERENCES) or "code of another package"
+    return f"{alike[0].label} with other settings than are asked for ({other})"

@@ -30,12 +30,13 @@ def reproduce(options: ReproduceOptions, say: Say) -> bool:
     plan = make_plan(options)
     if not plan.wanted:
         say("nothing to run: these experiments have none of these scenes")
-    for run in options.adopt:
-        say(f"adopted {report.adopt(run, plan.records)}")
-    store.check_captures(store.load(plan.records), plan.wanted)
+    adopted = [(run, report.adopt(run, plan.wanted)) for run in options.adopt]
+    store.check_captures([*store.load(plan.records), *(record for _, record in adopted)], plan.wanted)
     if options.dry_run:
-        list_plan(plan, say)
+        list_plan(plan, [record for _, record in adopted], say)
         return True
+    for run, record in adopted:
+        say(f"adopted {run}: {store.write(plan.records, record)}")
     draw = figure_drawer(options, plan)
     runner = make_runner(options, plan, say, draw)
     failures = [] if options.tables_only else run_plan(runner, plan, options.out)
@@ -64,9 +65,9 @@ def make_runner(options: ReproduceOptions, plan: StudyPlan, say: Say, draw: Call
     return Runner(plan.runs, plan.records, options.worker_count, options.devices, options.discard, say, draw)
 
 
-def list_plan(plan: StudyPlan, say: Say) -> None:
-    """List which runs are done and which are not."""
-    there = store.load(plan.records)
+def list_plan(plan: StudyPlan, adopted: list[store.Record], say: Say) -> None:
+    """List which runs are done and which are not, those `adopted` with the former."""
+    there = [*store.load(plan.records), *adopted]
     done = [store.find(there, spec) is not None for spec in plan.wanted]
     for spec, is_done in zip(plan.wanted, done):
         how = f"{spec.train.iterations:,} iterations, {spec.data.resolution}, {spec.data.split}"

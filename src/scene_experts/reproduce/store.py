@@ -258,7 +258,10 @@ def read(path: Path) -> list[Record]:
 def _read_runs(path: Path) -> tuple[str, list[dict[str, Any]]]:
     """Return the name of the capture and the JSON of its runs."""
     value = read_json(path, FILE)
-    if not isinstance(value, dict) or value.get("format") != FORMAT or not isinstance(value.get("scene"), str):
+    version = value.get("format") if isinstance(value, dict) else None
+    if isinstance(version, int) and version > FORMAT:
+        raise InputError(f"expected a {FILE} of format {FORMAT} or older in {path}, found format {version}; update scene-experts to read it")
+    if version != FORMAT or not isinstance(value.get("scene"), str):
         raise InputError(f"expected a {FILE} (format {FORMAT}) in {path}, found something else; remove it and reproduce again")
     if not isinstance(value.get("runs"), list):
         raise Damaged("no list of runs")
@@ -317,9 +320,9 @@ def find_all(records: Sequence[Record], specs: Sequence[Spec]) -> list[Record]:
 def check_captures(records: Sequence[Record], specs: Sequence[Spec]) -> None:
     """Raise InputError where a record of `specs` belongs to another capture of that name: it was
     scored on other views than its capture holds out, had another number of 3D points or other
-    camera poses, as after new structure from motion.
+    camera poses, as after new structure from motion, or other photographs or masks.
 
-    Checks the views of one run of each scene, and the points and poses of all. Captures that cannot
+    Checks the views of one run of each scene, and the rest of all. Captures that cannot
     be read are skipped here; their training reports the error.
     """
     by_scene: dict[str, list[tuple[Spec, Record]]] = {}
@@ -351,4 +354,10 @@ def check_captures(records: Sequence[Record], specs: Sequence[Spec]) -> None:
         if not all(same_poses(record.results.get("poses"), poses) for _, record in pairs):  # older records have no poses
             raise InputError(
                 f"expected records of '{spec.scene.name}' with the camera poses of {spec.scene.path}, found others in a record; {advice}"
+            )
+        photographs = capture.photographs()
+        if not all(record.results.get("photographs", photographs) == photographs for _, record in pairs):  # older records do not say
+            raise InputError(
+                f"expected records of '{spec.scene.name}' with the photographs and masks that are in {spec.scene.path} now, found a record "
+                f"of others; {advice}"
             )

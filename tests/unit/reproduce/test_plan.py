@@ -181,4 +181,14 @@ def test_code_of_another_package_counts(tmp_path, monkeypatch):
     assert code_of(ours) == "" and len(first) == 12
     module.write_text(text + "# changed\n")
     assert code_of(cfg) != first
+    (tmp_path / "beside").mkdir()
+    files = {"helper.py": "import beside.deep, foreign_package, numpy\n", "beside/__init__.py": "", "beside/deep.py": "", "other.py": ""}
+    for name, content in files.items():
+        (tmp_path / name).write_text(content)
+    module.write_text(text + "def later():\n    from helper import x\n")
+    found = code_of(cfg)
+    for name, counts in (("helper.py", True), ("beside/deep.py", True), ("other.py", False)):
+        (tmp_path / name).write_text(files[name] + "# changed\n")
+        assert (code_of(cfg) != found) == counts, name
+        found = code_of(cfg)
     assert identity("fox", ours, Data(FOX.path), first) != identity("fox", ours, Data(FOX.path))

@@ -81,4 +81,4 @@ def test_a_run_with_a_background_or_a_near_plane_of_its_own_is_not_adopted(tmp_p
         assert main(["train", "scaffold-gs", "--out", str(tmp_path / name), *words, *own]) == 0
         why = "expected an evaluated run" if name == "plain" else rf"expected the {name} that the recipe has .* without --{name}"
         with pytest.raises(InputError, match=why):
-            report.adopt(tmp_path / name, tmp_path / "records")
+            report.adopt(tmp_path / name, [])

@@ -63,6 +63,25 @@ def test_a_run_whose_checkpoints_are_gone_costs_its_picture_alone(tmp_path, caps
     assert "moe-gs-e3-top2 on fox, seed 0" in said and "README.md" in said
 
 
+def test_only_runs_that_are_asked_for_are_adopted_and_a_dry_run_writes_nothing(tmp_path, capsys):
+    capture = make_capture(tmp_path / "box", views=12, size=(48, 32), points=300).folder
+    run, out = str(tmp_path / "run"), ["--out", str(tmp_path / "out")]
+    assert cli.main(["train", "moe-gs", "--data", str(capture), "--out", run, "--iterations", "4", "--device", "cpu"]) == 0
+    assert cli.main(["eval", run, "--no-lpips", "--device", "cpu"]) == 0
+    ask = ["reproduce", "compare", "--recipes", "moe-gs", "scaffold-gs", "--captures", str(capture), "--adopt", run, *out]
+    capsys.readouterr()
+    assert cli.main([*ask, "--iterations", "5", "--dry-run"]) == 2
+    said = capsys.readouterr().err
+    assert "moe-gs on box, seed 0" in said and "iterations was 4, is now 5" in said
+    assert cli.main([*ask, "--iterations", "4", "--seeds", "1", "--dry-run"]) == 2
+    assert "moe-gs on box, seed 0" in capsys.readouterr().err
+    assert cli.main([*ask, "--iterations", "4", "--dry-run"]) == 0
+    said = capsys.readouterr().out
+    assert "done    moe-gs on box" in said and "to run  scaffold-gs on box" in said and not (tmp_path / "out" / "records").exists()
+    assert cli.main([*ask, "--iterations", "4", "--tables-only"]) == 0
+    assert f"adopted {run}" in capsys.readouterr().out and len(store.load(tmp_path / "out" / "records")) == 1
+
+
 def recipes_of(capsys, *args: str) -> tuple[int, set[str], set[str]]:
     """How many runs a plan has, and their recipes and seeds."""
     assert cli.main(["reproduce", *args, "--dry-run"]) == 0

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from scene_experts.core.errors import InputError
 from scene_experts.core.io import write_json
@@ -154,6 +155,34 @@ def test_records_of_other_cameras_with_the_same_points_are_refused(tmp_path):
     check_captures([replace(own, results={**own.results, "poses": capture.poses()})], [spec])
     with pytest.raises(InputError, match=naming("camera poses", "--records")):
         check_captures([replace(own, results={**own.results, "poses": other.poses()})], [spec])
+
+
+def test_records_of_other_photographs_or_masks_are_refused(tmp_path):
+    box = make_capture(tmp_path / "box", views=9)
+    spec = Spec(CaptureSpec("box", OWN, box.folder), "moe-gs", 0, Scale(iterations=3000))
+    capture = captures.load(spec.data)
+    own = replace(record(scene="box"), per_view={capture.views[i].name: {"psnr": 30.0} for i in capture.test})
+    check_captures([own], [spec])  # an older record does not say
+    own = replace(own, results={**own.results, "photographs": capture.photographs()})
+    check_captures([own], [spec])
+    path = capture.views[0].path
+    before = path.read_bytes()
+    path.write_bytes(before + b"\0")
+    with pytest.raises(InputError, match=naming("photographs and masks", "--records")):
+        check_captures([own], [spec])
+    path.write_bytes(before)
+    check_captures([own], [spec])
+    (box.folder / "masks").mkdir(exist_ok=True)
+    for view in capture.views:
+        Image.new("L", (view.camera.width, view.camera.height), 255).save(box.folder / "masks" / f"{view.name}.png")
+    with pytest.raises(InputError, match=naming("photographs and masks", "--records")):
+        check_captures([own], [spec])
+
+
+def test_records_of_a_newer_version_are_not_called_something_else(tmp_path):
+    (tmp_path / "fox.json").write_text('{"format": 99, "scene": "fox", "runs": []}')
+    with pytest.raises(InputError, match=naming("format 99", "update")):
+        load(tmp_path)
 
 
 def test_a_run_that_memory_may_have_limited_is_no_record(tmp_path):
