@@ -16,8 +16,11 @@ parser.add_argument("--iterations", type=int, default=7000)
 parser.add_argument("--every", type=int, default=500, help="iterations between two looks")
 arguments = parser.parse_args()
 
+capture = se.load_capture(arguments.capture)
+if not capture.test_cameras:  # few photographs: by default all are trained on
+    capture = se.load_capture(arguments.capture, split="mod8")
 recipe = se.recipe("moe-gs", iterations=arguments.iterations)
-trainer = se.Trainer(recipe, arguments.capture, arguments.run, preview_every=arguments.every)
+trainer = se.Trainer(recipe, capture, arguments.run, preview_every=arguments.every)
 best = 0.0
 for event in trainer:
     if isinstance(event, se.Previewed):

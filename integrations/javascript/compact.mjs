@@ -1,7 +1,7 @@
 // Reads compact files of scene-experts (docs/compact-file.md). No dependencies beyond the files beside it; browsers and Node 18 or newer.
 // Licence: Apache-2.0.
 //
-//   const scene = await readCompact(bytes);   // bytes: Uint8Array
+//   const scene = await readCompact(bytes);   // bytes: Uint8Array, Buffer or ArrayBuffer
 //
 // returns {header, cells, lattice, groups, networks, exact, checksum}: the whole numbers of the file in coding order; cells are [N, 3] in one
 // array. A value of a group is number * header.steps[group][channel] * 2 ** class, without the class in the group "extra"; a weight is
@@ -231,7 +231,15 @@ export function crc32(bytes, before = 0) {
 export const bytesOf = (numbers) => new Uint8Array(numbers.buffer, numbers.byteOffset, numbers.byteLength); // browsers run on little-endian machines
 
 // The header and the parts by name of a file that begins with `mark`.
-export async function open(bytes, mark, version) {
+// The bytes of an ArrayBuffer or of a view of one: Node's Buffer, for example, of which `slice` is no copy.
+export function asBytes(given) {
+  if (ArrayBuffer.isView(given)) return new Uint8Array(given.buffer, given.byteOffset, given.byteLength);
+  if (/^\[object (Shared)?ArrayBuffer\]$/.test(Object.prototype.toString.call(given))) return new Uint8Array(given);
+  throw new TypeError(`expected the bytes of a file as a Uint8Array or an ArrayBuffer, found ${Object.prototype.toString.call(given)}`);
+}
+
+export async function open(given, mark, version) {
+  const bytes = asBytes(given);
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   if (bytes.length < 16 || new TextDecoder("latin1").decode(bytes.subarray(0, 8)) !== mark) fail("another kind of file");
   if (crc32(bytes.subarray(0, -4)) !== view.getUint32(bytes.length - 4, true)) fail("bytes with another checksum");

@@ -114,6 +114,19 @@ def test_the_page_says_that_it_unpacks(tmp_path):
         assert made.said.startswith("unpacking ")
 
 
+@pytest.mark.parametrize("kind", ["live", "baked"])
+def test_a_page_that_is_cut_short_says_so(tmp_path, kind):
+    path = write(tmp_path / "a.html", kind)
+    whole = path.read_bytes()
+    with browsers(GL, WIDTH, HEIGHT) as make:
+        for end in (whole.index(b'id="scene">') + 200, whole.index(b'id="code">') + 200, whole.rindex(b"</script>")):
+            path.write_bytes(whole[:end])
+            made = make()
+            made.tab.goto(path.as_uri())
+            made.tab.wait_for_function(f"{SAID}.includes('cut short')")
+            assert made.tab.is_hidden("#bar")
+
+
 @pytest.mark.parametrize("allowed", [True, False])
 def test_a_page_that_is_the_text_of_a_frame(page, tmp_path, allowed):
     """As notebooks show it: key L writes into the frame's own address, and full screen has a button where the outer page allows it."""

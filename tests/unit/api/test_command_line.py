@@ -45,6 +45,16 @@ def test_what_no_command_can_say_is_left_empty():
     assert command_of(replace(cfg, recipe="mine"), data, OUT, TrainOptions()) == ""
     assert command_of(replace(cfg, scene=se.recipe("sags").scene), data, OUT, TrainOptions()) == ""
     assert command_of(cfg, data, None, TrainOptions()) == ""
+    assert command_of(se.recipe("moe-gs", **{"loss.depth_until": 30_001}), data, OUT, TrainOptions()) == "", "no flag sets it"
+    for names in (("a.jpg", "-b.jpg"), ("none",)):
+        assert command_of(cfg, replace(data, leave_out=names), OUT, TrainOptions()) == ""
+
+
+def test_names_that_look_like_flags_are_said_so_that_they_are_none():
+    cfg = se.recipe("moe-gs", **{"loss.tau": -0.5, "loss.opacity": 0.1})
+    data = replace(Data(Path("-x")), leave_out=("a b.jpg", "c.jpg"), background=(0.0, 0.5, 1.0))
+    command = parse_train(shlex.split(command_of(cfg, data, Path("-o"), TrainOptions()))[2:])
+    assert (command.cfg, command.data, command.out) == (cfg, data, Path("-o"))
 
 
 def test_a_limit_of_memory_is_said():

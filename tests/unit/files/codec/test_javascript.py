@@ -24,7 +24,8 @@ const {{ plain }} = await from("coder.mjs"), {{ loadCoder }} = await from("compi
 const out = [(await loadCoder()) === plain];
 for (const path of paths) {{
   try {{
-    const scene = await readCompact(new Uint8Array(readFileSync(path)), how === "plain" ? plain : undefined);
+    const bytes = readFileSync(path), whole = bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.length);
+    const scene = await readCompact({{ plain: bytes, compiled: whole }}[how] ?? new Uint8Array(whole), how === "plain" ? plain : undefined);
     out.push([scene.checksum, [...scene.cells.slice(0, 3)], scene.groups.feature.map((c) => c[0])]);
   }} catch (error) {{
     out.push(String(error.message));
