@@ -187,7 +187,8 @@ def adopt(run: Path, wanted: Sequence[Spec]) -> Record:
                 raise InputError(f"expected {expected}, found {other} in {run}; train it without {flag_of(name)}")
     found = store.read_run(run, captures.name_capture(Path(config.data.path)), code_of(config.train))
     if all(store.find([found], spec) is None for spec in wanted):
-        raise InputError(f"expected --adopt with a run that this command asks for, found {describe_other(found, wanted)} in {run}; leave it out")
+        other = describe_other(found, wanted)
+        raise InputError(f"expected --adopt with a run that this command asks for, found {other} in {run}; leave it out")
     return found
 
 

@@ -260,7 +260,7 @@ def _read_runs(path: Path) -> tuple[str, list[dict[str, Any]]]:
     value = read_json(path, FILE)
     version = value.get("format") if isinstance(value, dict) else None
     if isinstance(version, int) and version > FORMAT:
-        raise InputError(f"expected a {FILE} of format {FORMAT} or older in {path}, found format {version}; update scene-experts to read it")
+        raise InputError(f"expected a {FILE} of format {FORMAT} or older in {path}, found format {version}; update scene-experts")
     if version != FORMAT or not isinstance(value.get("scene"), str):
         raise InputError(f"expected a {FILE} (format {FORMAT}) in {path}, found something else; remove it and reproduce again")
     if not isinstance(value.get("runs"), list):

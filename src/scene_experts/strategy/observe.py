@@ -53,7 +53,7 @@ def observe(table: Table, decoded: Decoded, render: Render) -> None:
     rows, slots = (len(table),), (len(table), raw.shape[1])
     if [tuple(column.shape) for column in columns] != [rows, rows, slots, slots]:
         found = ", ".join(str(list(column.shape)) for column in columns)
-        raise InputError(f"expected statistics of {rows[0]:,} rows and {slots[1]} slots each, found shapes {found}; begin the training anew")
+        raise InputError(f"expected statistics of {rows[0]:,} rows and {slots[1]} slots each, found {found}; begin the training anew")
     parts = [*columns, raw, render.mean2d_grad]
     if triton.covers(*parts):
         return _launch(table.stats, decoded, render, raw.contiguous())

@@ -10,7 +10,6 @@ import scene_experts as se
 from scene_experts.api.camera import from_trained, to_trained
 from scene_experts.data.views import World
 
-
 SMALL = se.Camera.look_at((0, 0, 1), (0, 0, 0), width=8, height=8)
 
 

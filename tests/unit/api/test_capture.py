@@ -83,7 +83,7 @@ def test_a_new_camera_takes_the_lens_of_the_photographs(capture):
 @pytest.mark.parametrize("size", [320, (32,), (32, 24.5), "32x24", np.zeros((2, 2)), (0, 24)])
 def test_a_size_that_is_none_is_named(capture, size):
     for call in (lambda: capture.look_at((9, 9, 9), size=size), lambda: capture.camera_path(frames=2, size=size)):
-        with pytest.raises(se.InputError, match="in px|width and a height"):
+        with pytest.raises(se.InputError, match=r"in px|width and a height"):
             call()
     for good in ((32, 24), np.array([32, 24])):
         assert capture.look_at((9, 9, 9), size=good).width == 32
