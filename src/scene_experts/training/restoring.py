@@ -39,7 +39,7 @@ def restore_stats(scene: Scene, tensors: dict[str, Tensor]) -> None:
     """Give the table of a scene the statistics that a checkpoint has. Raises Damaged unless each has
     one number for each row or slot."""
     rows = len(scene.table)
-    slots = (rows, getattr(scene, "K", 1))
+    slots = (rows, scene.K)
     found = {name.removeprefix("stats."): value for name, value in tensors.items() if name.startswith("stats.")}
     for name, value in found.items():
         if tuple(value.shape) not in ((rows,), slots) or not value.is_floating_point():
