@@ -28,6 +28,10 @@ merge: merge the runs of the blocks into one run.
 `{PROG} blocks merge --help` show the options."""
 
 
+PLANNED = ("--out", "--iterations", "--views", "--init-from", "--stop-at", "--growth.bounds", "--rates.anneal", "--rates.anneal-from")
+"""Options of the trainings that the plan sets."""
+
+
 @dataclass(frozen=True)
 class PlanCommand:
     """Divide a capture into blocks with equal numbers of points, choose the views of each block,
@@ -122,6 +126,8 @@ def commands(command: PlanCommand, bounds: list[tuple[float, ...]], every: int =
     from scene_experts.training.config import flags_of
 
     out, total, more = command.out, command.iterations, split_words(command.train)
+    if planned := [word for word in more if flag_name(word) in PLANNED]:
+        raise InputError(f"expected options for --train that the plan leaves open, found {planned[0]}, which it sets; leave it out")
     usual = Data(Path(), normalise=defaults_of(command.data.path).normalise)  # what `train` takes without options
     read = {name: value for name, value in vars(command.data).items() if value != getattr(usual, name)}
     data = options(**{"data" if name == "path" else name: value for name, value in read.items()})
@@ -134,7 +140,7 @@ def commands(command: PlanCommand, bounds: list[tuple[float, ...]], every: int =
     until = max(1, total // 3, cfg.scaled_scene().dense_until)  # a scene is divided among experts before it is cut into blocks
     still = [(place, 0) for place in marked(cfg, Pace)]
     own = flags_of(cfg, [*still, *(changes(cfg.scene, cfg.scene.of_views(every), "scene.") or [])])
-    block = [PROG, "train", command.recipe, *data, *without(more, own[::2])]
+    block = [PROG, "train", command.recipe, *data, *without(more, [*own[::2], "--rates.networks"])]
     same = [*options(**{"rates.networks": 0}), *own]  # what all anchors share stays equal in all blocks
     lines = [[*train, *options(out=coarse, iterations=total, stop_at=until), *few, *memory]]
     for number, run in enumerate(runs):
@@ -157,13 +163,18 @@ def options(**values: object) -> list[str]:
     return [word for place, value in values.items() for word in words_of(place, value)]
 
 
+def flag_name(word: str) -> str:
+    """Return the name of the flag that a word of a command is, written with hyphens."""
+    return word.partition("=")[0].replace("_", "-") if word.startswith("--") else word
+
+
 def without(words: list[str], flags: list[str]) -> list[str]:
     """Return the options `words` without these flags and their values."""
     out, given = [], False  # given: the word before was one of the flags
     for word in words:
-        name, equals, _ = word.partition("=")
-        out += [] if given or name in flags else [word]
-        given = not given and name in flags and not equals
+        here, equals = flag_name(word) in flags, "=" in word
+        out += [] if given or here else [word]
+        given = not given and here and not equals
     return out
 
 

@@ -14,6 +14,7 @@ from functools import partial
 import torch
 from rich.console import Console
 
+from scene_experts.core.errors import InputError
 from scene_experts.core.extras import install_line
 from scene_experts.data.store import available_bytes
 from scene_experts.native import library as native
@@ -185,7 +186,12 @@ def memory() -> Check:
 def lpips() -> Check:
     from scene_experts.evaluate import weights
 
-    reasons = {net: reason for net in ("vgg", "alex") if (reason := weights.explain_missing(net))}
+    reasons = {}
+    for net in ("vgg", "alex"):
+        try:
+            weights.load(net)
+        except (weights.MissingWeights, InputError) as error:
+            reasons[net] = str(error)
     if not reasons:
         return Check("LPIPS weights", True, f"found for VGG and AlexNet (kept in {weights.cache_dir()})")
     why = "; ".join(reason.removesuffix(f": {weights.HOW}") for reason in reasons.values())
@@ -214,7 +220,7 @@ def _version(name: str) -> str | None:
     if importlib.util.find_spec(name) is None:
         return None
     try:
-        return importlib.metadata.version(name)
+        return importlib.metadata.version(importlib.metadata.packages_distributions().get(name, [name])[0])
     except importlib.metadata.PackageNotFoundError:
         return "version unknown"
 

@@ -8,6 +8,7 @@ import logging
 import os
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -131,11 +132,15 @@ def _make_lock(path: Path) -> FileLock:
         return FileLock(path)
 
 
+_UMASK = threading.Lock()
+
+
 def new_file_mode(most: int) -> int:
     """Return the permissions of a new file or folder: `most` without the bits of the umask.
     Temporary files are created with fewer."""
-    umask = os.umask(0)
-    os.umask(umask)
+    with _UMASK:  # it is the process's
+        umask = os.umask(0)
+        os.umask(umask)
     return most & ~umask
 
 

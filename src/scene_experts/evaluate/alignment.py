@@ -22,6 +22,7 @@ from scene_experts.scene import Draws
 from scene_experts.scene.poses import at_pose, attach
 
 STEPS, RATE = 80, 1e-3  # steps and learning rate of Adam (rad and extents); the rate falls linearly to 0
+ALIGNED_SHORT = "cameras fitted to these photographs"
 ALIGNED = f"held-out cameras aligned with the frozen scene by their photographs, {STEPS} steps of Adam"
 
 

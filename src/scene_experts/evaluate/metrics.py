@@ -140,10 +140,14 @@ class Perceptual:
         """
         networks, sources, absent = {}, {}, {}
         for net in dict.fromkeys(NETWORKS.values()):
-            if fetch and weights.explain_missing(net, explicit):
-                weights.download(net, progress=progress)
             try:
-                tensors, sources[net] = weights.load(net, explicit)
+                try:
+                    tensors, sources[net] = weights.load(net, explicit)
+                except weights.MissingWeights:
+                    if not fetch:
+                        raise
+                    weights.download(net, progress=progress)
+                    tensors, sources[net] = weights.load(net, explicit)
                 networks[net] = Lpips(net, tensors).to(device)
             except weights.MissingWeights as error:
                 absent |= {metric: str(error) for metric, backbone in NETWORKS.items() if backbone == net}

@@ -3,6 +3,7 @@ and captioned rows."""
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
 from collections import deque
@@ -44,12 +45,22 @@ def from_8bit(pixels: np.ndarray) -> Tensor:
 def make_file_names(views: Iterable[str]) -> dict[str, str]:
     """Return the relative name of the picture of each view.
 
-    The extension becomes .png. It is kept before .png if two views differ only by their extensions.
+    The extension becomes .png. It is kept before .png if two views differ only by their extensions,
+    and a number is added if this is the name of another picture.
     """
     views = list(views)
     plain = {view: str(PurePosixPath(view.replace("\\", "/")).with_suffix("")) for view in views}
     folded = [name.casefold() for name in plain.values()]  # some file systems ignore case
-    return {view: f"{name if folded.count(name.casefold()) == 1 else view}.png" for view, name in plain.items()}
+    found: dict[str, str] = {}
+    taken = {name for name in folded if folded.count(name) == 1}
+    for view, name in plain.items():
+        if folded.count(name.casefold()) > 1:
+            base = view.replace("\\", "/")
+            tries = itertools.chain([base], (f"{base}-{number}" for number in itertools.count(2)))
+            name = next(each for each in tries if each.casefold() not in taken)
+            taken.add(name.casefold())
+        found[view] = f"{name}.png"
+    return found
 
 
 def remove_pictures(folder: Path) -> None:

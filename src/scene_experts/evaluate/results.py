@@ -3,6 +3,8 @@ runs may be compared."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import shlex
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -37,6 +39,8 @@ PROTOCOL = {  # what must agree before scores may be compared: key in results.js
     "left_out": ("photographs left out", "leave_out"),
     "views": ("views", "views"),
     "view_count": ("number of views", "max_views"),
+    "scored": ("scored photographs", "split"),
+    "photographs": ("files of photographs and masks", "data"),
     "mean_pixels": ("picture size", "resolution"),  # after the views: those of another split may have other sizes
     "appearance": ("appearance codes", "appearance"),
     "alignment": ("alignment of held-out cameras", "align_poses"),
@@ -44,7 +48,7 @@ PROTOCOL = {  # what must agree before scores may be compared: key in results.js
     "background": ("background of transparent photographs", "background"),
 }
 DEFAULTS = {"appearance": "rule", "left_out": [], "alignment": "none"}  # the meaning of a results file without the key
-MAY_LACK = ("background",)  # a results file without one of these agrees with every other
+MAY_LACK = ("background", "scored", "photographs")  # a results file without one of these agrees with every other
 
 
 @dataclass(frozen=True)
@@ -130,9 +134,15 @@ def describe_views(capture: Capture, cameras: Sequence[Camera], options: EvalOpt
         "mean_pixels": round(sum(c.width * c.height for c in cameras) / len(cameras)),
         **({} if capture.alpha_over is None else {"background": list(capture.alpha_over)}),
         "poses": capture.poses(),
+        "scored": hash_names([capture.views[camera.id].name for camera in cameras]),
         "photographs": capture.photographs(),
         **({} if capture.points is None else {"points": len(capture.points.xyz)}),  # those of other poses are others
     }
+
+
+def hash_names(names: Sequence[str]) -> str:
+    """Return a short hash of names, whatever their order."""
+    return hashlib.sha256(json.dumps(sorted(names)).encode()).hexdigest()[:16]
 
 
 def describe_run(about: About, step: int, rasterize: Rasterizer, perceptual: Perceptual) -> dict[str, Any]:
@@ -194,6 +204,8 @@ def load_results(run: Path, training: bool = False) -> dict[str, Any]:
 
     training: Whether those of the training views do for a run that holds none out.
     """
+    if not run.exists():
+        raise InputError(f"expected a run folder at {run}, found nothing; correct the path")
     path = run if run.is_file() else results_file(run) if training else run / "results.json"
     if not path.is_file():
         raise InputError(f"expected an evaluated run with {path.name} in {run}, found none; run `{command_of(run)}` first")

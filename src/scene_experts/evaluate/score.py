@@ -34,6 +34,7 @@ from scene_experts.evaluate.alignment import align
 from scene_experts.evaluate.experts import write_expert_strips
 from scene_experts.evaluate.metrics import Perceptual, score
 from scene_experts.evaluate.options import EvalOptions
+from scene_experts.evaluate.photographs import NAME as TRAINING_VIEWS
 from scene_experts.evaluate.results import About
 from scene_experts.evaluate.timing import measure_speed
 
@@ -128,6 +129,8 @@ def evaluate(
             **results.describe_run(about or About(), step, rasterize, perceptual),
             "evaluation_seconds": time.perf_counter() - began,
         }
+        if not options.suffix:
+            (out / f"{TRAINING_VIEWS}.json").unlink(missing_ok=True)  # it may be of another iteration
         write_json(out / f"per_view{options.suffix}.json", per_view)
         write_json(out / f"results{options.suffix}.json", found)
         return found

@@ -21,6 +21,7 @@ from scene_experts.core.errors import InputError
 from scene_experts.core.io import read_json
 from scene_experts.core.reading.budget import RUN
 from scene_experts.core.reading.source import guarding, sentence
+from scene_experts.evaluate.alignment import ALIGNED_SHORT
 from scene_experts.evaluate.results import check_protocol, describe_failed, find_outdated, load_results
 
 Format = Literal["table", "markdown", "csv"]
@@ -272,7 +273,8 @@ def _describe_protocol(results: dict[str, Any]) -> str:
     """Return what was scored, in words."""
     part = "right halves of " if results.get("appearance") == "half" else ""
     views = f"{part}{results['view_count']} {results['views']} views"
-    return sentence(f"{results['capture']}: {views} ({results['split']}), {results['resolution']}")
+    aligned = f", {ALIGNED_SHORT}" if results.get("alignment") else ""
+    return sentence(f"{results['capture']}: {views} ({results['split']}), {results['resolution']}{aligned}")
 
 
 @cache

@@ -13,6 +13,7 @@ import importlib
 import os
 import pickle
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -113,6 +114,8 @@ def download(net: str, *, backbones: str = TORCHVISION, linears: str = LPIPS, pr
         progress: Called with the bytes so far and in total (0: unknown).
     """
     folder = cache_dir()
+    with suppress(OSError):
+        cache_path(net).unlink()  # without whole weights: it is damaged
     for base, (name, digest) in ((backbones, BACKBONE_FILES[net]), (linears, LINEAR_FILES[net])):
         fetch([f"{base}/{name}"], folder / name, digest, progress=progress, advice="give --lpips-weights")
     _, what = load(net)

@@ -23,6 +23,7 @@ from scene_experts.core.reading import budget
 from scene_experts.core.reading.source import opening
 from scene_experts.core.version import __version__
 from scene_experts.data.capture import Capture
+from scene_experts.evaluate.alignment import ALIGNED_SHORT
 from scene_experts.evaluate.pictures import to_8bit, write_picture
 from scene_experts.evaluate.results import load_results
 from scene_experts.files import registry
@@ -150,7 +151,8 @@ def make_card(
     }
     if metrics:
         task = {"type": "image-to-3d", "name": "novel view synthesis"}
-        result = {"task": task, "dataset": {"type": scene, "name": f"held-out views of {scene}"}, "metrics": metrics}
+        name = f"held-out views of {scene}{f', {ALIGNED_SHORT}' if scores and scores.get('alignment') else ''}"
+        result = {"task": task, "dataset": {"type": scene, "name": name}, "metrics": metrics}
         head["model-index"] = [{"name": f"{scene}, {recipe}", "results": [result]}]
     lines = ["---", yaml.safe_dump(head, sort_keys=False, allow_unicode=True).strip(), "---", "", f"# {scene}", ""]
     maker = f"scene-experts {__version__}"
@@ -177,7 +179,9 @@ def make_card(
     if metrics:
         views = f"{scores.get('view_count', 'the')} held-out views"
         resolution, split = scores.get("resolution", "unknown"), scores.get("split", "unknown")
-        lines += ["## Scores", "", f"Means over {views} (split `{split}`, resolution `{resolution}`), of the scene with its networks:", ""]
+        fitted = f" ({ALIGNED_SHORT})" if scores.get("alignment") else ""
+        about = f"Means over {views}{fitted} (split `{split}`, resolution `{resolution}`), of the scene with its networks:"
+        lines += ["## Scores", "", about, ""]
         lines += ["| metric | value |", "|---|---|", *(f"| {metric['name']} | {metric['value']} |" for metric in metrics), ""]
     lines += ["## Licence", ""]
     if licence == UNKNOWN:

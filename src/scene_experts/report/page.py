@@ -17,6 +17,7 @@ from scene_experts.core.io import write_bytes
 from scene_experts.core.plain import to_json
 from scene_experts.core.reading.budget import RUN
 from scene_experts.core.reading.source import guarding, inside
+from scene_experts.evaluate.alignment import ALIGNED_SHORT
 from scene_experts.evaluate.photographs import WORST
 from scene_experts.evaluate.results import describe_failed, find_difference, find_failed, find_outdated
 from scene_experts.evaluate.tables import ResultTable, explain, make_table
@@ -52,7 +53,7 @@ def write(runs: Sequence[Path], out: Path | None = None) -> Path:
     if out is not None and out.is_dir():
         out = out / NAME
     if out is not None and out.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"expected --out as a folder or a file ending in .html, found {out}; choose one of those")
+        raise InputError(f"expected --out as a folder or a file ending in .html, found {out}; make the folder first, or name a file")
     with guarding(runs[0] if len(runs) == 1 else "one of the runs", RUN):  # the files of a run may hold anything
         sources = tell_apart([read_run(run) for run in runs])
         page = build_page(sources).encode()
@@ -116,7 +117,8 @@ def describe_scores(r: dict[str, Any]) -> str:
     whole = f" of {r['iterations']:,}" if r.get("step") and (r.get("iterations") or 0) > r["step"] else ""
     steps = f", {r['step']:,}{whole} iterations" if r.get("step") else ""
     views = {"test": "held-out", "train": "training"}.get(str(r.get("views")), r.get("views"))
-    return f"{r.get('view_count')} {views} views ({r.get('split')}), {r.get('resolution')}{steps}"
+    aligned = f", {ALIGNED_SHORT}" if r.get("alignment") else ""
+    return f"{r.get('view_count')} {views} views ({r.get('split')}), {r.get('resolution')}{steps}{aligned}"
 
 
 def find_failures(sources: Sequence[ShownRun]) -> list[str]:

@@ -84,6 +84,13 @@ def test_blocks_have_the_dropout_and_the_jitter_of_a_training_of_all_views(few, 
     assert coarse.few_views == joint.few_views == few
 
 
+def test_a_rate_of_the_networks_is_that_of_the_coarse_and_the_joint_training(capture, tmp_path):
+    words = ["blocks", "plan", str(capture), "--out", str(tmp_path / "plan"), "--blocks", "2", "--train=--rates.networks 0.001"]
+    assert cli.main(words) == 0
+    lines = [line for line in (tmp_path / "plan" / "commands.sh").read_text().splitlines() if "--out" in line and "train" in line]
+    assert [line.partition("--rates.networks ")[2].split()[0] for line in lines] == ["0.001", "0", "0", "0.001"]
+
+
 def test_words_that_do_not_fit(capture, tmp_path, capsys):
     out = ["--out", str(tmp_path / "plan")]
     for words, found in (
@@ -100,6 +107,8 @@ def test_words_that_do_not_fit(capture, tmp_path, capsys):
         (["blocks", "plan", str(capture), *out, "--blocks", "300"], "same coordinate; give smaller --blocks"),
         (["blocks", "plan", str(capture), *out, "--train=--seed '3"], "--train"),
         (["blocks", "plan", str(capture), *out, "--train=--exposure"], "--exposure"),
+        (["blocks", "plan", str(capture), *out, "--train=--stop-at 9"], "--stop-at, which it sets"),
+        (["blocks", "plan", str(capture), *out, "--train=--init_from=x"], "which it sets"),
         (["blocks", "plan", str(capture), *out, "--train=--refine-poses"], "--refine-poses"),
         (["blocks", "plan", str(capture), *out, "--train=--resolution longest:40"], "--resolution"),
         (["blocks", "merge", str(tmp_path), *out, "--runs", str(tmp_path)], "plan.json"),

@@ -123,9 +123,14 @@ def test_without_weights_the_reason_is_reported(monkeypatch: pytest.MonkeyPatch)
 
 def test_only_missing_weights_are_downloaded(monkeypatch: pytest.MonkeyPatch) -> None:
     fetched: list[str] = []
-    monkeypatch.setattr(weights, "explain_missing", lambda net, explicit=None: None if net == "vgg" or fetched else "absent")
+
+    def load(net: str, explicit: Path | None = None) -> tuple[dict[str, Tensor], str]:
+        if net == "alex" and not fetched:  # also where a damaged file is there
+            raise weights.MissingWeights("found a wrong checksum")
+        return random_tensors(net), "here"
+
     monkeypatch.setattr(weights, "download", lambda net, progress=None: fetched.append(net))
-    monkeypatch.setattr(weights, "load", lambda net, explicit=None: (random_tensors(net), "here"))
+    monkeypatch.setattr(weights, "load", load)
     assert not Perceptual.find(fetch=True).absent and fetched == ["alex"]
 
 

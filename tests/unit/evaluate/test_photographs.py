@@ -65,6 +65,7 @@ def test_a_bad_photograph_is_first_and_named(tmp_path: Path) -> None:
     run = se.train(se.recipe("scaffold-gs", iterations=150, **{"scene.voxel_size": 0.1}), made.folder, tmp_path / "run", progress=False)
     run.evaluate(lpips=False)
     found = read_photographs(tmp_path / "run")
+    assert (tmp_path / "run" / "training_views.json").is_file()
     assert len(found) == 14 and (found[0].name, found[0].part) == ("view_003.png", "training")
     assert any(line.startswith("view_003.png fits the others badly") for line in describe_outliers(found))
     for kind in ("gt", "renders"):

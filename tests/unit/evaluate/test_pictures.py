@@ -37,6 +37,9 @@ def test_names_stay_apart() -> None:
     assert found["b/1.jpg"] == "b/1.png" and found["a/1.jpg"] == "a/1.png"
     assert found["x.1.jpg"] == "x.1.png" and found["x.2.jpg"] == "x.2.png"
     assert found["y.jpg"] == "y.jpg.png" and found["Y.png"] == "Y.png.png"
+    for views in (["a.jpg", "a.png", "a.jpg.tif"], ["a.jpg", "A.JPG"], ["a.jpg", "A.JPG", "a.JPG.x", "A.jpg-2.x"], ["b\\1.jpg", "b/1.png"]):
+        found = pictures.make_file_names(views)
+        assert len({name.casefold() for name in found.values()}) == len(views) and not any("\\" in name for name in found.values())
 
 
 def test_error_colours_run_from_black_to_white() -> None:

@@ -71,6 +71,14 @@ def test_the_first_difference_in_the_protocol_is_named():
     )
 
 
+@pytest.mark.parametrize("key, option", [("scored", "--split"), ("photographs", "--data")])
+def test_runs_of_other_photographs_with_the_same_count_are_not_compared(key, option):
+    one = {"capture": "fern", "split": "files", "view_count": 3}
+    check_protocol(["a", "b"], [one, {**one, key: "0123"}])  # an older file does not say
+    with pytest.raises(InputError, match=naming(option, "photographs")):
+        check_protocol(["a", "b"], [{**one, key: "0123"}, {**one, key: "4567"}])
+
+
 def test_runs_without_the_same_photographs_are_not_compared():
     one = {"capture": "fox"}
     check_protocol(["a", "b"], [one, {**one, "left_out": []}])

@@ -64,6 +64,9 @@ class FakeCapture:
     def poses(self):
         return ""
 
+    def photographs(self):
+        return "files"
+
 
 class FakeScene(Scene):
     """A scene that decodes 2 of 6 anchors. 3 of their 8 Gaussians have positive opacity."""
@@ -209,6 +212,14 @@ def test_training_views_have_results_of_their_own(tmp_path: Path) -> None:
     assert results["views"] == "train" and (tmp_path / "train" / "renders" / "day" / "3.png").is_file()
     assert json.loads((tmp_path / "results_train.json").read_text()) == results
     assert json.loads((tmp_path / "results.json").read_text()) == held_out
+
+
+def test_training_views_of_an_earlier_evaluation_are_removed(tmp_path: Path) -> None:
+    """An interruption before they are scored again must not leave those of another iteration beside new scores."""
+    for name, stays in (("training_views.json", False), ("per_view_train.json", True)):
+        (tmp_path / name).write_text("{}")
+        evaluated(tmp_path)
+        assert (tmp_path / name).exists() == stays
 
 
 def test_empty_split(tmp_path: Path) -> None:

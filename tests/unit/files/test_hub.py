@@ -49,6 +49,9 @@ def test_the_card_states_licence_tags_scores_and_files(tmp_path):
         "2,000",
     ):
         assert fact in body
+    fitted = {**scores, "alignment": "held-out cameras aligned with the frozen scene"}
+    for text in (body, hub.make_card(run, files, fitted, "mit", [])):  # type: ignore[arg-type]
+        assert text.count("cameras fitted to these photographs") == (0 if text == body else 2)
     head, body = front_matter(hub.make_card(run, files, {}, hub.UNKNOWN, []))  # type: ignore[arg-type]
     assert "model-index" not in head and head["license"] == "unknown" and "not stated" in body
 
