@@ -186,7 +186,7 @@ def test_the_scene_comes_back_out_of_the_page(tmp_path):
     check("baked-html", read(tmp_path / "a.html"), s)
     text = (tmp_path / "a.html").read_text()
     assert not re.search(r"""(src|href)=["']?(https?:)?//""", text) and "WORLD LABS" in text
-    assert text.count("</script>") == 4
+    assert text.count("</script>") == 5
 
 
 @pytest.mark.parametrize("factor", [1e-9, 1e-4, 3e3, 1e9])
