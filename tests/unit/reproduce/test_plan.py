@@ -181,13 +181,21 @@ def test_code_of_another_package_counts(tmp_path, monkeypatch):
     assert code_of(ours) == "" and len(first) == 12
     module.write_text(text + "# changed\n")
     assert code_of(cfg) != first
-    (tmp_path / "beside").mkdir()
+    for name in ("beside", "numpy"):
+        (tmp_path / name).mkdir()
     files = {"helper.py": "import beside.deep, foreign_package, numpy\n", "beside/__init__.py": "", "beside/deep.py": "", "other.py": ""}
+    files |= {"numpy/__init__.py": "", "broken.py": "def"}  # of another distribution, and of nobody who can run it
     for name, content in files.items():
         (tmp_path / name).write_text(content)
-    module.write_text(text + "def later():\n    from helper import x\n")
+    module.write_text(text + "def later():\n    from helper import x\n    import broken\n")
     found = code_of(cfg)
-    for name, counts in (("helper.py", True), ("beside/deep.py", True), ("other.py", False)):
+    for name, counts in (
+        ("helper.py", True),
+        ("beside/deep.py", True),
+        ("other.py", False),
+        ("numpy/__init__.py", False),
+        ("broken.py", True),
+    ):
         (tmp_path / name).write_text(files[name] + "# changed\n")
         assert (code_of(cfg) != found) == counts, name
         found = code_of(cfg)
